@@ -106,6 +106,8 @@ def rllib_program(values: TrainedHyperparams, *, env_id: str, env_args: Mapping[
     }
     if isinstance(values, PPOHyperparams):
         model["vf_share_layers"] = values.vf_share_layers
+        if values.free_log_std:
+            model["free_log_std"] = True
     if values.conv_filters is not None:
         model["conv_filters"] = [list(item) for item in values.conv_filters]
         notes.append("RLlib pads the convolutions of conv_filters, which we don't.")

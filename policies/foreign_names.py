@@ -104,6 +104,12 @@ _PPO: tuple[ForeignName, ...] = (
         ("initializer",),
         "orthogonal for true, which SB3 has by default; gains of the layers are not quite the same",
     ),
+    ForeignName(
+        SB3,
+        "log_std_init",
+        ("free_log_std",),
+        "true for SB3's deviation, the same for all observations; its logarithm is 0 at first, as by default there",
+    ),
     ForeignName(SB3, "share_features_extractor", ("vf_share_layers",), "SB3 shares its extractor alone, not net_arch"),
     ForeignName(RLLIB, "minibatch_size", ("minibatch_size",)),
     ForeignName(RLLIB, "sgd_minibatch_size", ("minibatch_size",)),
@@ -115,6 +121,7 @@ _PPO: tuple[ForeignName, ...] = (
     ForeignName(RLLIB, "vf_clip_param", ("vf_clip_param",), "RLlib's default is 10, not null"),
     ForeignName(RLLIB, "vf_loss_coeff", ("vf_loss_coeff",)),
     ForeignName(RLLIB, "vf_share_layers", ("vf_share_layers",)),
+    ForeignName(RLLIB, "free_log_std", ("free_log_std",)),
     ForeignName(RLLIB, "entropy_coeff", ("entropy_coeff",), _ENTROPY),
     ForeignName(
         RLLIB, "entropy_coeff_schedule", ("entropy_coeff", "entropy_coeff_final", "entropy_decay_steps"), _ENTROPY

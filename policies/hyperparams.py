@@ -114,6 +114,11 @@ class PPOHyperparams(_Hyperparams):
     )
     vf_loss_coeff: NonNegativeFloat = Field(0.5, description="Weight of the value loss.")
     vf_share_layers: bool = Field(False, description="One encoder for policy and value function.")
+    free_log_std: bool = Field(
+        False,
+        description="For continuous actions: one log standard deviation for each component, the same for all "
+        "observations and 0 at first; false: the policy's network gives them for each observation.",
+    )
     entropy_coeff: NonNegativeFloat = Field(0.0, description="Weight of the entropy bonus.")
     entropy_coeff_final: NonNegativeFloat | None = Field(
         None, description="Move entropy_coeff linearly to this over entropy_decay_steps; null: it stays."

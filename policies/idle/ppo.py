@@ -77,6 +77,7 @@ PPO_RULES: dict[str, Rules] = {
     "vf_clip_range": (_NO_VALUE_LOSS,),
     "vf_loss_coeff": ALWAYS,
     "vf_share_layers": ALWAYS,
+    "free_log_std": ALWAYS,  # without continuous actions it is refused
     "entropy_coeff": _start_of_schedule("entropy_decay_steps", "entropy_coeff_final"),
     "entropy_coeff_final": ALWAYS,
     "entropy_decay_steps": _decay_of_schedule("entropy_decay_steps", "entropy_coeff", "entropy_coeff_final"),

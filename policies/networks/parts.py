@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
+import torch
 from torch import nn
 
 from policies.envs.masks import seen_by_networks
@@ -56,6 +57,8 @@ class PPONetworks(nn.Module):
         self.pi = nn.Linear(num_features, num_policy_outputs(action_space))
         self.vf = nn.Linear(num_features, 1)
         initialize_networks(config, hidden=[self.encoder], heads=[(self.pi, 0.01), (self.vf, 1.0)])
+        if config["free_log_std"]:
+            free_log_std(self.pi)
 
 
 class DQNNetworks(nn.Module):
@@ -80,6 +83,14 @@ class DQNNetworks(nn.Module):
         self.vf = nn.Linear(self.encoder.num_features, 1) if config["dueling"] else None
         heads = [(head, 1.0) for head in (self.af, self.vf) if head is not None]
         initialize_networks(config, hidden=[self.encoder], heads=heads)
+
+
+def free_log_std(head: nn.Linear) -> None:
+    """Set the log standard deviations of a policy head to 0 for all observations; their biases alone may learn."""
+    num_actions = head.out_features // 2
+    with torch.no_grad():
+        head.weight[num_actions:] = 0.0
+        head.bias[num_actions:] = 0.0
 
 
 def num_policy_outputs(action_space: gym.Space[Any]) -> int:
@@ -124,7 +135,7 @@ def model_config(hyperparams: TrainedHyperparams) -> dict[str, Any]:
         "normalize_observations": hyperparams.normalize_observations,
     }
     if isinstance(hyperparams, PPOHyperparams):
-        return {**config, "vf_share_layers": hyperparams.vf_share_layers}
+        return {**config, "vf_share_layers": hyperparams.vf_share_layers, "free_log_std": hyperparams.free_log_std}
     config |= {
         "double_q": hyperparams.double_q,
         "dueling": hyperparams.dueling,

@@ -61,6 +61,7 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
         self.encoder, self.pi, self.vf = parts.encoder, parts.pi, parts.vf
         self._actor_name = "encoder" if self._shares else "actor_encoder"
         self._is_gaussian = isinstance(self.action_space, gym.spaces.Box)
+        self._has_free_log_std = bool(config["free_log_std"])
 
     @property
     def _actor(self) -> Encoder:
@@ -79,10 +80,16 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
         return {Columns.EMBEDDINGS: embeddings, Columns.ACTION_DIST_INPUTS: outputs}
 
     def _policy(self, features: Tensor) -> Tensor:
-        outputs: Tensor = self.pi(features)
         if not self._is_gaussian:
+            outputs: Tensor = self.pi(features)
             return outputs
-        mean, log_std = outputs.chunk(2, dim=-1)
+        if self._has_free_log_std:
+            # The other rows of the weights are 0, and get no gradient.
+            num_actions = self.pi.out_features // 2
+            mean = nn.functional.linear(features, self.pi.weight[:num_actions], self.pi.bias[:num_actions])
+            log_std = self.pi.bias[num_actions:].expand_as(mean)
+        else:
+            mean, log_std = self.pi(features).chunk(2, dim=-1)
         return torch.cat((mean, log_std.clamp(-_LOG_STD_CLIP, _LOG_STD_CLIP)), dim=-1)
 
     def compute_values(self, batch: Batch, embeddings: Tensor | None = None) -> Tensor:

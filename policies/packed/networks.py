@@ -40,6 +40,7 @@ class StackedNetworks:
         weights: All weights, shape (K, P); a layer's block is its matrix, then its bias as one more row.
         gradients: The gradients of the last `backward`, in the shape of the weights.
         layers: Views of the weights, shape (K, inputs + 1, outputs) each, those of the convolutions first.
+        gradient_layers: Views of the gradients, in the same shapes.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class StackedNetworks:
         self.weights = torch.zeros(num_networks, num_weights, device=device)
         self.gradients = torch.zeros_like(self.weights)
         self.layers = self._views(self.weights)
-        self._gradient_layers = self._views(self.gradients)
+        self.gradient_layers = self._views(self.gradients)
         self._activation = ACTIVATIONS[activation]
         self._stacked = StackedConvolutions(convolutions, self._activation)
         self._kept: list[tuple[Tensor, Tensor]] = []
@@ -118,7 +119,7 @@ class StackedNetworks:
     def backward(self, gradient: Tensor) -> None:
         """Set `gradients` from the gradient of the outputs of the last `forward`, shape (K, B, A)."""
         num = len(self.convolutions)
-        dense, gradients = self.layers[num:], self._gradient_layers[num:]
+        dense, gradients = self.layers[num:], self.gradient_layers[num:]
         x, _ = self._kept[-1]
         _set_gradients(gradients[-1], x, gradient)
         for number in range(len(dense) - 2, -1, -1):
@@ -131,7 +132,7 @@ class StackedNetworks:
                 torch.bmm(x.transpose(1, 2), gradient, out=gradients[0])
         if num:
             gradient = torch.bmm(gradient, dense[0][:, :-1].transpose(1, 2))
-            self._stacked.backward(gradient, self.layers[:num], self._gradient_layers[:num])
+            self._stacked.backward(gradient, self.layers[:num], self.gradient_layers[:num])
         self._kept = []
 
 

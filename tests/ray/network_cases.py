@@ -74,6 +74,25 @@ def check_conv_filters(build: Build, algorithm: Algorithm) -> None:
             assert not torch.equal(value, before[name]), name
 
 
+@reaches("ppo", field="free_log_std")
+def check_free_log_std(build: Build, algorithm: Algorithm) -> None:
+    observations = torch.randn(32, 3, generator=torch.Generator().manual_seed(0))
+    for free in (False, True):
+        algo = build(algorithm, "Pendulum-v1", free_log_std=free, lr=0.01)
+        for trained in (False, True):
+            for module in modules_of(algo):
+                with torch.no_grad():
+                    outputs = module.forward_inference({"obs": observations})["action_dist_inputs"]
+                log_stds = outputs[:, 1]
+                assert bool((log_stds == log_stds[0]).all()) is free
+                # The portable policy and packs read the whole layer.
+                assert bool((module.pi.weight[1] == 0.0).all()) is free
+                if free:
+                    assert bool(log_stds[0] == module.pi.bias[1])
+                    assert bool(log_stds[0] == 0.0) is not trained
+            algo.train()
+
+
 @reaches("ppo", "dqn", field="normalize_observations")
 def check_normalize_observations(build: Build, algorithm: Algorithm) -> None:
     plain = module_of(build(algorithm, normalize_observations=False))

@@ -107,6 +107,20 @@ def check_conv_filters() -> None:
 
 
 @arrives
+def check_free_log_std() -> None:
+    """A free one learns as RLlib's; its rows of the weights stay 0, where a member beside it moves its own."""
+    pairs, stack, _ = compare("Pendulum-v1", [{"entropy_coeff": 0.3}, {"entropy_coeff": 0.3, "free_log_std": True}])
+    assert len(stack._groups) == 1
+    for ours, theirs in pairs:
+        assert max(differences(ours, theirs).values()) < ROUNDING
+    (plain, _), (free, _) = pairs
+    assert np.abs(plain.last_gradients["pi.weight"][1]).max() > 1e-4
+    for values in (free.last_gradients, free.weights, *free.moments.values()):
+        np.testing.assert_array_equal(values["pi.weight"][1], 0.0)
+    assert abs(free.last_gradients["pi.bias"][1]) > 1e-3
+
+
+@arrives
 def check_vf_share_layers() -> None:
     _, changed, _ = updates(shared={"vf_share_layers": True}, vf_loss_coeff=2.0)
     assert {name.split(".")[1] for name in changed.weights if name.startswith("encoder")} == {"encoder"}

@@ -100,7 +100,10 @@ def shake(stack: PPOStack, scale: float = 0.1) -> None:
         rng = np.random.default_rng(member.seed)
         for name, value in member.weights.items():
             if not name.startswith("obs_"):
-                np.add(value, scale * rng.normal(size=value.shape), out=value, casting="unsafe")
+                moved = scale * rng.normal(size=value.shape)
+                if name == "pi.weight" and member.hyperparams.free_log_std:
+                    moved[len(moved) // 2 :] = 0.0
+                np.add(value, moved, out=value, casting="unsafe")
     stack._stale = True
 
 

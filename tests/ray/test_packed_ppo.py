@@ -48,14 +48,17 @@ PACKS: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
         {"vf_clip_param": 2000.0, "clip_param": 0.05},
         {"hidden_sizes": (5,), "entropy_coeff": 0.2, "grad_clip": 2.0, "vf_clip_range": 0.05},
         {"hidden_sizes": (6,), "normalize_advantages": False, "vf_clip_param": 3000.0, "vf_clip_range": 0.1},
+        {"hidden_sizes": (7,), "free_log_std": True, "entropy_coeff": 0.3, "grad_clip": 0.5},
     ]),
     "linear, gaussian, shared layers, normalised": (
         "Pendulum-v1", {"activation": "linear", "vf_share_layers": True, "normalize_observations": True}, [
         {"entropy_coeff": 0.1},
         {"hidden_sizes": (6,), "clip_param": 0.05, "lr": 1e-3, "lr_final": 1e-4, "lr_decay_steps": 1000},
+        {"hidden_sizes": (5,), "free_log_std": True, "grad_clip": 1.0},
     ]),
     "tanh, gaussian, KL": ("Pendulum-v1", {"use_kl_loss": True}, [
         {"kl_target": 1e-4, "grad_clip": 0.3},
+        {"hidden_sizes": (4,), "free_log_std": True, "initializer": "orthogonal"},
         {"hidden_sizes": (3,), "kl_coeff": 1.5},
     ]),
     "several choices": ("TestReply-v0", {"entropy_coeff": 0.1}, [

@@ -72,6 +72,20 @@ def test_an_encoder_and_observations_that_do_not_go_together_are_refused_with_bo
         plan(env, **spec)
 
 
+@pytest.mark.parametrize(
+    "spec",
+    [
+        {"hyperparams": {"free_log_std": True}},
+        {"space": {"free_log_std": {"choice": [False, True]}}, "num_samples": 1},
+    ],
+)
+def test_a_free_deviation_without_continuous_actions_is_refused(spec: dict[str, Any]) -> None:
+    (section,) = spec.keys() & {"hyperparams", "space"}
+    with pytest.raises(SpecError, match=rf"{section}\.free_log_std is true, but .*CartPole-v1.*Discrete"):
+        plan("CartPole-v1", **spec)
+    assert plan("Pendulum-v1", **spec).trials
+
+
 @pytest.mark.parametrize("algorithm", ["random", "constant"])
 def test_baselines_need_no_encoder(algorithm: Algorithm) -> None:
     assert plan(IMAGES, algorithm).env.observes_images

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 
 from policies.acting.baselines import BASELINES
@@ -49,9 +50,9 @@ def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperpa
         hyperparams: The hyperparameters of every point.
 
     Raises:
-        SpecError: There is a penalty but no failure; convolutions but no images, or images but no convolutions; or a
-            constant action that the environment does not have; a module of the user's own and a mask of actions; or the
-            objective is about a threshold that nobody knows.
+        SpecError: There is a penalty but no failure; convolutions but no images, or images but no convolutions; a free
+            deviation but no continuous actions; a constant action that the environment does not have; a module of the
+            user's own and a mask of actions; or the objective is about a threshold that nobody knows.
     """
     _check_constant_actions(spec, env, hyperparams)
     if spec.objective.type == "steps_to_threshold" and spec.objective.threshold is None and env.threshold is None:
@@ -75,6 +76,20 @@ def check_env_rules(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperpa
         )
     if spec.algorithm not in BASELINES:
         _check_networks(spec, env, hyperparams)
+    if not isinstance(env.action_space, gym.spaces.Box):
+        _refuse_free_log_std(spec, env, hyperparams)
+
+
+def _refuse_free_log_std(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -> None:
+    domain = spec.space.get("free_log_std")
+    searched = [] if domain is None else [value for _, value in domain.probes()]
+    if True in [*searched, *(getattr(values, "free_log_std", False) for values in hyperparams)]:
+        place = "hyperparams.free_log_std" if domain is None else "space.free_log_std"
+        raise SpecError(
+            f"{place} is true, but the actions of {env.env_id} are not continuous ({env.action_space}): they have no "
+            "standard deviation.",
+            f"Leave {place} out.",
+        )
 
 
 def _check_constant_actions(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Hyperparams]) -> None:

@@ -27,7 +27,7 @@ FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
     {
         # The network, or its running statistics, would differ from those that are copied.
         "hidden_sizes", "activation", "initializer", "conv_filters", "normalize_observations", "normalize_rewards",
-        "vf_share_layers", "dueling", "target_network",
+        "vf_share_layers", "free_log_std", "dueling", "target_network",
         # The optimizer's state would differ from the one that is copied.
         "optimizer", "rmsprop_momentum",
         # There would be other sub-environments, by which a trial's seeds are counted.

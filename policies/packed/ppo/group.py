@@ -97,6 +97,11 @@ class PPOGroup:
         self._unfinished: tuple[ppo.Parts, Tensor | None, int]
         self._grad_clip = self._per_member(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
         self._clips = any(item.grad_clip is not None for item in self._hyperparams)
+        # By numbers, as a list of booleans would be made into them at each update.
+        self._free_log_stds = torch.tensor(
+            [index for index, item in enumerate(self._hyperparams) if heads.is_gaussian and item.free_log_std],
+            device=device, dtype=torch.int64,
+        )  # fmt: skip
         self._coefficients = ppo.Coefficients(
             clip_param=self._per_member(lambda item: item.clip_param),
             vf_clip_param=self._per_member(lambda item: math.inf if item.vf_clip_param is None else item.vf_clip_param),
@@ -226,6 +231,9 @@ class PPOGroup:
         gradient[:num_members, :, : self._num_outputs] = policy_gradient
         gradient[-num_members:, :, -1 if self._shares else 0] = value_gradient
         networks.backward(gradient)
+        if len(self._free_log_stds):
+            # Their weights are 0 and stay so: the biases alone learn.
+            networks.gradient_layers[-1][self._free_log_stds, :-1, self._num_outputs // 2 : self._num_outputs] = 0.0
         norms = None
         if self._clips:
             norms = clip_by_global_norm(networks.gradients, self._grad_clip, self._rows.networks_per_member)
