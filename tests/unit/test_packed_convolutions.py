@@ -86,7 +86,8 @@ def test_outputs_and_gradients_are_torchs(filters: tuple[Any, ...], activation: 
     inputs = torch.from_numpy(with_ones(images.reshape(len(members), B, -1).numpy())).repeat(2, 1, 1)
     outputs = rows.networks.forward(inputs)
     evaluated = rows.networks.evaluate(inputs[: len(members)], len(members), 2 * len(members))
-    np.testing.assert_array_equal(evaluated, outputs[len(members) :])
+    # Not to the bit: weights that begin elsewhere in memory are multiplied by another kernel on some CPUs.
+    np.testing.assert_allclose(evaluated, outputs[len(members) :], atol=ROUNDING)
     acted = ActingNetworks(rows.networks, len(members))(images.reshape(len(members), B, -1).numpy())
     np.testing.assert_allclose(acted, outputs[: len(members)], atol=ROUNDING)
     gradient = torch.zeros_like(outputs)
