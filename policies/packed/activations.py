@@ -49,6 +49,16 @@ def _tanh_of_few(x: Floats) -> Floats:
     return np.tanh(x, out=x)
 
 
+def _tanh(x: Tensor) -> Tensor:
+    # NumPy's takes a tenth of the time of torch's on a CPU, which is more than that of the product before it: both are
+    # exact to a unit in the last place or two.
+    if x.device.type != "cpu":
+        return x.tanh_()
+    values = x.numpy()
+    np.tanh(values, out=values)
+    return x
+
+
 @dataclass(frozen=True)
 class Activation:
     """The functions of one activation; `linear` has none."""
@@ -80,7 +90,7 @@ class Activation:
 ACTIVATIONS = {
     "linear": Activation(),
     "relu": Activation(torch.relu_, _relu_backward, of_few=_relu_of_few),
-    "tanh": Activation(torch.tanh_, _aten.tanh_backward, of_few=_tanh_of_few),
+    "tanh": Activation(_tanh, _aten.tanh_backward, of_few=_tanh_of_few),
     "silu": Activation(_silu, _silu_backward, keeps_input=True),
     "elu": Activation(_elu, _elu_backward, keeps_input=True),
     "gelu": Activation(functional.gelu, _aten.gelu_backward, keeps_input=True),

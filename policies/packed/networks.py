@@ -12,6 +12,7 @@ The backward pass is written out. On networks of this size torch's graph costs m
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +24,15 @@ from policies.packed.activations import ACTIVATIONS
 from policies.packed.convolutions import Convolution, StackedConvolutions
 
 Floats = NDArray[np.float32]
+
+
+# A cache line. Where matrices do not begin at one, some CPUs multiply them by other kernels, which round otherwise: then
+# what a network computes depends on its place in the stack.
+_LINE = 16
+
+
+def _whole_lines(num_weights: int) -> int:
+    return math.ceil(num_weights / _LINE) * _LINE
 
 
 class StackedNetworks:
@@ -37,7 +47,8 @@ class StackedNetworks:
             with.
 
     Attributes:
-        weights: All weights, shape (K, P); a layer's block is its matrix, then its bias as one more row.
+        weights: All weights, shape (K, P); a layer's block is its matrix, then its bias as one more row. It begins at a
+            multiple of 16 numbers; between blocks there are zeros.
         gradients: The gradients of the last `backward`, in the shape of the weights.
         layers: Views of the weights, shape (K, inputs + 1, outputs) each, those of the convolutions first.
         gradient_layers: Views of the gradients, in the same shapes.
@@ -57,7 +68,7 @@ class StackedNetworks:
             *((one.window + 1, one.num_filters) for one in convolutions),
             *((inputs + 1, outputs) for inputs, outputs in itertools.pairwise(sizes)),
         ]
-        num_weights = sum(rows * columns for rows, columns in self._shapes)
+        num_weights = sum(_whole_lines(rows * columns) for rows, columns in self._shapes)
         self.weights = torch.zeros(num_networks, num_weights, device=device)
         self.gradients = torch.zeros_like(self.weights)
         self.layers = self._views(self.weights)
@@ -69,9 +80,8 @@ class StackedNetworks:
     def _views(self, flat: Tensor) -> list[Tensor]:
         views, start = [], 0
         for rows, columns in self._shapes:
-            stop = start + rows * columns
-            views.append(flat[:, start:stop].view(self.num_networks, rows, columns))
-            start = stop
+            views.append(flat[:, start : start + rows * columns].view(self.num_networks, rows, columns))
+            start += _whole_lines(rows * columns)
         return views
 
     def views_of(self, flat: Tensor) -> list[Tensor]:

@@ -362,5 +362,13 @@ def test_networks_of_other_depth_are_not_grouped() -> None:
 
 def test_a_stack_starts_without_weights() -> None:
     networks = StackedNetworks(2, (3, 4, 1), "relu")
-    assert networks.weights.shape == (2, 4 * 4 + 5)
+    assert networks.weights.shape == (2, 16 + 16)
     assert (networks.weights == 0).all()
+
+
+def test_every_layer_of_every_network_begins_at_a_cache_line() -> None:
+    """Otherwise kernels of some CPUs round by a network's place in the stack."""
+    networks = StackedNetworks(3, (3, 5, 7, 2), "relu")
+    for layers in (networks.layers, networks.gradient_layers):
+        assert [tuple(layer.shape[1:]) for layer in layers] == [(4, 5), (6, 7), (8, 2)]
+        assert {layer[row].data_ptr() % 64 for layer in layers for row in range(3)} == {0}
