@@ -26,8 +26,8 @@ from policies.packed.convolutions import Convolution, StackedConvolutions
 Floats = NDArray[np.float32]
 
 
-# A cache line. Where matrices do not begin at one, some CPUs multiply them by other kernels, which round otherwise: then
-# what a network computes depends on its place in the stack.
+# A cache line. Where matrices do not begin at one, some CPUs multiply them by other kernels, which round otherwise:
+# what a network computes would depend on its place in the stack.
 _LINE = 16
 
 
