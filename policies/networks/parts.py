@@ -57,7 +57,7 @@ class PPONetworks(nn.Module):
         self.pi = nn.Linear(num_features, num_policy_outputs(action_space))
         self.vf = nn.Linear(num_features, 1)
         initialize_networks(config, hidden=[self.encoder], heads=[(self.pi, 0.01), (self.vf, 1.0)])
-        if config["free_log_std"]:
+        if config.get("free_log_std"):  # a checkpoint from before this setting has no such entry
             free_log_std(self.pi)
 
 

@@ -61,7 +61,7 @@ class PPOModule(ObservationStatistics, DefaultPPOTorchRLModule):  # type: ignore
         self.encoder, self.pi, self.vf = parts.encoder, parts.pi, parts.vf
         self._actor_name = "encoder" if self._shares else "actor_encoder"
         self._is_gaussian = isinstance(self.action_space, gym.spaces.Box)
-        self._has_free_log_std = bool(config["free_log_std"])
+        self._has_free_log_std = bool(config.get("free_log_std"))
 
     @property
     def _actor(self) -> Encoder:
