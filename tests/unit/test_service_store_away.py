@@ -68,9 +68,9 @@ def test_a_store_that_does_not_answer_is_told_soon_and_holds_up_nobody_else(
         # More than there are threads for requests.
         asked = [pool.submit(client.get, path) for path in SWEEP_PATHS * 15]
         assert client.get("/healthz").status_code == 200
-        # Had it waited for one of the 40 threads, those before it in the row would have been answered by now. A count,
+        # Had it waited for one of the 40 threads, some 20 of those before it would have been answered by now. A count,
         # not a time: a busy machine is slow at both.
-        assert sum(item.done() for item in asked) < len(asked) - 40
+        assert sum(item.done() for item in asked) < 10
         answers = [item.result() for item in asked]
         assert time.monotonic() - began < HANG_S / 2
     for answer in answers:
