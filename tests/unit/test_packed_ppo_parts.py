@@ -91,6 +91,43 @@ def test_gradients_by_hand_are_those_of_the_loss(sizes: tuple[int, ...], with_kl
 
 
 @pytest.mark.usefixtures("in_double")
+@pytest.mark.parametrize("with_old_values", [False, True])
+@pytest.mark.parametrize("with_kl", [False, True])
+@pytest.mark.parametrize("num_actions", [1, 3])
+def test_gradients_by_hand_of_continuous_actions_are_those_of_the_loss(
+    num_actions: int, with_kl: bool, with_old_values: bool
+) -> None:
+    outputs, values, batch = make_case(num_actions, num_actions, with_kl=False, with_old_values=with_old_values)
+    heads = ppo.Heads(())
+    # Of some rows, standard deviations beyond both limits.
+    outputs[..., num_actions:] *= 0.25
+    outputs[:, :5, num_actions:] = -21.0
+    outputs[:, 5:10, num_actions:] = 21.0
+    rng = torch.Generator().manual_seed(1)
+    old_outputs = outputs + 0.2 * torch.randn(outputs.shape, generator=rng)
+    # Were these drawn by others, their ratios would be 0 or infinite.
+    old_outputs[:, :10] = outputs[:, :10]
+    mean, log_std = old_outputs.chunk(2, dim=-1)
+    batch.actions = mean + log_std.clamp(-20.0, 20.0).exp() * torch.randn(mean.shape, generator=rng)
+    batch.logp = ppo.log_probabilities(old_outputs, batch.actions, heads=heads)
+    batch.old_outputs = old_outputs if with_kl else None
+    ratio = (ppo.log_probabilities(outputs, batch.actions, heads=heads) - batch.logp).exp()
+    for limited in (ratio > 1.3, ratio < 0.7):
+        for sign in (-1, 1):
+            assert (limited & (sign * batch.advantages > 0)).sum() > M * B / 50
+    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, heads=heads)
+    outputs.requires_grad_()
+    values.requires_grad_()
+    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, heads=heads)
+    parts.total_loss.sum().backward()  # type: ignore[no-untyped-call]
+    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
+        close(mine, other)
+    assert (found[0][:, :10, num_actions:] == 0).all()
+    assert (found[0][:, 10:, num_actions:] != 0).any(dim=-1).sum() > M * B / 2
+    assert (parts.kl > 0).all() == with_kl
+
+
+@pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("entropy_coeff", [0.0, 0.01])
 def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
     outputs, values, batch = make_case(2, with_kl=False)

@@ -109,19 +109,17 @@ def gradients(
     Returns:
         Two tensors with the shapes of `outputs` and `values`.
     """
-    if heads.is_gaussian:
-        return _by_autograd(outputs, values, batch, coefficients, heads)
     # Written out, because torch's graph of these small tensors would cost more than the networks.
+    policy = _gaussian_gradient if heads.is_gaussian else _choices_gradient
+    return policy(outputs, batch, coefficients, heads), _value_gradient(values, batch, coefficients)
+
+
+def _choices_gradient(outputs: Tensor, batch: Minibatch, coefficients: Coefficients, heads: Heads) -> Tensor:
     num_rows = outputs.shape[1]
     logp_all = heads.log_softmax(outputs)
     probabilities = logp_all.exp()
-    logp = (logp_all * batch.actions).sum(dim=-1)
-    ratio = (logp - batch.logp).exp_()
-    surrogate = batch.advantages * ratio
-    limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param).mul_(batch.advantages)
-    # The minimum passes the gradient where the ratio itself is smaller, where both are equal, and where it is NaN.
-    weight = torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / num_rows)
-    out = (probabilities - batch.actions).mul_(weight.unsqueeze(-1))
+    weight = _weights((logp_all * batch.actions).sum(dim=-1), batch, coefficients)
+    out = (probabilities - batch.actions).mul_(weight)
     if bool(coefficients.entropy_coeff.any()):
         entropy = heads.entropies(probabilities, logp_all)
         scale = (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
@@ -129,7 +127,47 @@ def gradients(
     if batch.old_outputs is not None:
         old = heads.log_softmax(batch.old_outputs).exp() if len(heads.sizes) > 1 else batch.old_outputs.softmax(dim=-1)
         out += (probabilities - old).mul_((coefficients.kl_coeff / num_rows).unsqueeze(-1))
-    return out, _value_gradient(values, batch, coefficients)
+    return out
+
+
+def _gaussian_gradient(outputs: Tensor, batch: Minibatch, coefficients: Coefficients, _: Heads) -> Tensor:
+    """Return the gradient for means m and log standard deviations l, of standard deviations s, (M, B, 2A).
+
+    With z = (a - m) / s, the log probability of an action a moves by z / s with m and by z^2 - 1 with l; the entropy by
+    1 with l; the divergence from a policy of m' and s' by (m - m') / s^2 with m and by 1 - (s'^2 + (m - m')^2) / s^2
+    with l.
+    """
+    num_rows, num_actions = outputs.shape[1], outputs.shape[2] // 2
+    mean, log_std = _split(outputs)
+    inverse = torch.exp(-log_std)
+    z = (batch.actions - mean).mul_(inverse)
+    squares = z * z
+    rows = squares.mul(0.5).add_(log_std).sum(dim=-1).add_(num_actions * _HALF_LOG_TWO_PI).neg_()
+    weight = _weights(rows, batch, coefficients)
+    out = torch.empty_like(outputs)
+    of_mean, of_log_std = out[..., :num_actions], out[..., num_actions:]
+    torch.mul(z, inverse, out=of_mean).mul_(-weight)
+    torch.sub(1.0, squares, out=of_log_std).mul_(weight)
+    of_log_std -= (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
+    if batch.old_outputs is not None:
+        old_mean, old_log_std = _split(batch.old_outputs)
+        scale = (coefficients.kl_coeff / num_rows).unsqueeze(-1)
+        moved, precision = mean - old_mean, inverse * inverse
+        spread = torch.exp(2 * old_log_std).add_(moved * moved).mul_(precision)
+        of_mean += moved.mul_(precision).mul_(scale)
+        of_log_std += (1.0 - spread).mul_(scale)
+    # Beyond its limits a standard deviation does not move.
+    of_log_std.masked_fill_(outputs[..., num_actions:].abs() > LOG_STD_CLIP, 0.0)
+    return out
+
+
+def _weights(logp: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tensor:
+    """Return what the gradient of each row's log probability, (M, B), counts in the mean of what is won, (M, B, 1)."""
+    ratio = (logp - batch.logp).exp_()
+    surrogate = batch.advantages * ratio
+    limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param).mul_(batch.advantages)
+    # The minimum passes the gradient where the ratio itself is smaller, where both are equal, and where it is NaN.
+    return torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / logp.shape[1]).unsqueeze(-1)
 
 
 def _value_gradient(values: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tensor:
@@ -155,16 +193,6 @@ def _squared_errors(values: Tensor, batch: Minibatch, coefficients: Coefficients
     # Rows inside their range are left as they are, rather than rounded once more: so members without one are computed
     # as if nobody beside them had one.
     return torch.where(moves.abs() > limit, torch.maximum(squares, at_end), squares)
-
-
-def _by_autograd(
-    outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, heads: Heads
-) -> tuple[Tensor, Tensor]:
-    outputs, values = outputs.detach().requires_grad_(), values.detach().requires_grad_()
-    with torch.enable_grad():
-        total = loss(outputs, values, batch, coefficients, heads=heads).total_loss.sum()
-        policy_gradient, value_gradient = torch.autograd.grad(total, (outputs, values))
-    return policy_gradient, value_gradient
 
 
 def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coefficients, *, heads: Heads) -> Parts:
