@@ -131,6 +131,32 @@ def test_costs_of_a_file_that_are_beyond_all_axes_stop_nothing(page: Page, store
         page.says(".front > p", HOSTILE)
 
 
+# How many dots of the canvas have the front's colour.
+PAINTED = """
+    const canvas = document.querySelector(".front canvas");
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    const told = getComputedStyle(document.documentElement).getPropertyValue("--series-0").trim();
+    const of = [1, 3, 5].map((start) => parseInt(told.slice(start, start + 2), 16));
+    let count = 0;
+    for (let at = 0; at < data.length; at += 4) count += of.every((value, index) => data[at + index] === value);
+    return count;
+"""
+
+
+def test_costs_of_a_file_that_begin_at_nothing_are_drawn(page: Page, store: SweepStore, tmp_path: Path) -> None:
+    content = json.loads(gzip.decompress(sweep_file(store)))
+    # No logarithm has room for the first, whatever a file says.
+    content["front"]["costs_lie_far_apart"] = True
+    for index, item in enumerate(content["front"]["front"]["points"]):
+        item["num_env_steps"] = index * 1000.0
+    (tmp_path / "free.tunejobs").write_bytes(gzip.compress(json.dumps(content).encode()))
+    page.open("#/file")
+    page.browser.find_element("id", "chosen-file").send_keys(str(tmp_path / "free.tunejobs"))
+    page.says(".front", "The cheapest near the best:")
+    # A line of 2 from side to side, and more.
+    page.until(lambda: page.run(PAINTED) > 200, "the front is not painted")
+
+
 def test_it_comes_as_trials_end(page: Page, live: Live, store: SweepStore) -> None:
     made = make_sweep(name="runs", points=[{"lr": 0.01}, {"lr": 0.001}, {"lr": 0.02}], with_best=False)
     told = made.trials.copy()
