@@ -38,13 +38,13 @@ def _facts(source: Source) -> list[tuple[str, str]]:
     frame = trials_frame(trials, source.results, threshold=goal)
     statuses = Counter(trial.status for trial in trials)
     facts = [
-        ("trials", ", ".join(f"{count} {status}" for status, count in statuses.most_common()) or "none"),
+        ("trials", ", ".join(f"{count:,} {status}" for status, count in statuses.most_common()) or "none"),
         ("env steps", number(sum(trial.num_env_steps for trial in trials))),
         ("wall time", duration(source.sweep.run_time_s)),
     ]
     if goal is not None:
         solved = frame["num_env_steps_to_solve"].dropna()
-        facts.append(("solved in training", f"{len(solved)} of {len(trials)}"))
+        facts.append(("solved in training", f"{len(solved):,} of {len(trials):,}"))
         if len(solved):
             facts.append(("fewest env steps to solve", number(int(solved.min()))))
     return facts
