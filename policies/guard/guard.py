@@ -18,6 +18,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -78,6 +79,7 @@ class _Child:
         self.surroundings = surroundings
         self.modules: set[str] = set()
         self.has_worked = False
+        self._starter = threading.current_thread()
         with standard_streams():
             self._begin()
 
@@ -115,6 +117,11 @@ class _Child:
         error of the next one is reported.
         """
         return self.process.poll() is not None
+
+    @property
+    def may_be_lost(self) -> bool:
+        """Whether it was started by another thread, which may end: Linux ends it with that one."""
+        return self._starter not in (threading.current_thread(), threading.main_thread())
 
     def frames(self) -> list[str]:
         """Return the frames of the user's code, innermost first, as Python's fault handler wrote them."""
@@ -228,7 +235,10 @@ class EnvGuard:
         modules = set(allowed_modules())
         child = self._child
         if child is not None and (
-            child.was_lost or child.surroundings != _Surroundings.now() or not child.modules <= modules
+            child.was_lost
+            or child.may_be_lost
+            or child.surroundings != _Surroundings.now()
+            or not child.modules <= modules
         ):
             self.close()
         self.start()

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -240,6 +241,29 @@ def test_a_child_that_died_while_nobody_asked_is_replaced(number: Signals | None
             present(guard._child).process.send_signal(number)
         present(guard._child).process.wait()
         assert guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)["env_id"] == "CartPole-v1"
+
+
+def test_a_child_that_another_thread_started_is_replaced_before_it_ends_with_that() -> None:
+    """Linux ends a child with the thread that started it, which may be while it works for another one."""
+    with EnvGuard() as guard:
+        may_end = threading.Event()
+
+        def starting() -> None:
+            guard.start()
+            may_end.wait()
+
+        thread = threading.Thread(target=starting)
+        thread.start()
+        while guard._child is None:
+            time.sleep(0.01)
+        pids = [guard._child.process.pid]
+        for _ in range(2):
+            told = guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
+            assert told["env_id"] == "CartPole-v1"
+            pids.append(present(guard._child).process.pid)
+            may_end.set()
+            thread.join()
+    assert pids[0] != pids[1] == pids[2]
 
 
 def test_one_block_within_another_shares_its_guard() -> None:
