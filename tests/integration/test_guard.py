@@ -246,17 +246,18 @@ def test_a_child_that_died_while_nobody_asked_is_replaced(number: Signals | None
 def test_a_child_that_another_thread_started_is_replaced_before_it_ends_with_that() -> None:
     """Linux ends a child with the thread that started it, which may be while it works for another one."""
     with EnvGuard() as guard:
-        may_end = threading.Event()
+        has_begun, may_end = threading.Event(), threading.Event()
 
         def starting() -> None:
             guard.start()
+            has_begun.set()
             may_end.wait()
 
-        thread = threading.Thread(target=starting)
+        # A daemon: a failure below must not leave a thread that pytest waits for.
+        thread = threading.Thread(target=starting, daemon=True)
         thread.start()
-        while guard._child is None:
-            time.sleep(0.01)
-        pids = [guard._child.process.pid]
+        assert has_begun.wait(60)
+        pids = [present(guard._child).process.pid]
         for _ in range(2):
             told = guard.run("check_env", "CartPole-v1", env_args={}, algorithm=None)
             assert told["env_id"] == "CartPole-v1"

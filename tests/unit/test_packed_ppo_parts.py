@@ -66,6 +66,20 @@ COEFFICIENTS = ppo.Coefficients(
 )
 
 
+def checked_gradients(
+    outputs: torch.Tensor, values: torch.Tensor, batch: Minibatch, coefficients: ppo.Coefficients, heads: ppo.Heads
+) -> tuple[tuple[torch.Tensor, torch.Tensor], ppo.Parts]:
+    """The gradients by hand, compared with those that torch finds of the loss, and the loss."""
+    found = ppo.gradients(outputs, values, batch, coefficients, heads=heads)
+    outputs.requires_grad_()
+    values.requires_grad_()
+    parts = ppo.loss(outputs, values, batch, coefficients, heads=heads)
+    parts.total_loss.sum().backward()  # type: ignore[no-untyped-call]
+    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
+        close(mine, other)
+    return found, parts
+
+
 @pytest.mark.usefixtures("in_double")
 @pytest.mark.parametrize("with_old_values", [False, True])
 @pytest.mark.parametrize("with_kl", [False, True])
@@ -80,13 +94,7 @@ def test_gradients_by_hand_are_those_of_the_loss(sizes: tuple[int, ...], with_kl
             assert (limited & (sign * batch.advantages > 0)).sum() > M * B / 20
     errors = (values - batch.value_targets) ** 2
     assert 0.1 < (errors > COEFFICIENTS.vf_clip_param).float().mean() < 0.9
-    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, heads=heads)
-    outputs.requires_grad_()
-    values.requires_grad_()
-    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, heads=heads)
-    parts.total_loss.sum().backward()  # type: ignore[no-untyped-call]
-    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
-        close(mine, other)
+    _, parts = checked_gradients(outputs, values, batch, COEFFICIENTS, heads)
     assert (parts.kl > 0).all() == with_kl
 
 
@@ -115,13 +123,7 @@ def test_gradients_by_hand_of_continuous_actions_are_those_of_the_loss(
     for limited in (ratio > 1.3, ratio < 0.7):
         for sign in (-1, 1):
             assert (limited & (sign * batch.advantages > 0)).sum() > M * B / 50
-    found = ppo.gradients(outputs, values, batch, COEFFICIENTS, heads=heads)
-    outputs.requires_grad_()
-    values.requires_grad_()
-    parts = ppo.loss(outputs, values, batch, COEFFICIENTS, heads=heads)
-    parts.total_loss.sum().backward()  # type: ignore[no-untyped-call]
-    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
-        close(mine, other)
+    found, parts = checked_gradients(outputs, values, batch, COEFFICIENTS, heads)
     assert (found[0][:, :10, num_actions:] == 0).all()
     assert (found[0][:, 10:, num_actions:] != 0).any(dim=-1).sum() > M * B / 2
     assert (parts.kl > 0).all() == with_kl
@@ -138,12 +140,7 @@ def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
             "entropy_coeff": column(*[entropy_coeff] * M),
         }
     )
-    found = ppo.gradients(outputs, values, batch, coefficients, heads=ppo.Heads((2,)))
-    outputs.requires_grad_()
-    values.requires_grad_()
-    ppo.loss(outputs, values, batch, coefficients, heads=ppo.Heads((2,))).total_loss.sum().backward()  # type: ignore[no-untyped-call]
-    for mine, other in zip(found, (outputs.grad, values.grad), strict=True):
-        close(mine, other)
+    checked_gradients(outputs, values, batch, coefficients, ppo.Heads((2,)))
 
 
 def by_definition(values: torch.Tensor, old_values: torch.Tensor, targets: torch.Tensor, limit: float) -> torch.Tensor:
