@@ -28,7 +28,7 @@ def setting_score(settings: SettingsRecord) -> str:
         low, high = sorted((sign * best.lower, sign * best.upper))
         parts[0] += f" ({said(low)} to {said(high)} with 95 %, over training seeds)"
     if best.num_solved is not None:
-        parts.append(f"{best.num_solved} of {counted(len(best.scores), 'seed')} solved it")
+        parts.append(f"{best.num_solved} of {counted(len(best.scores), 'seed')} solved it in training")
     if best.num_failed:
         parts.append(f"{best.num_failed} failed")
     return "; ".join(parts)

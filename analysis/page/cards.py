@@ -181,7 +181,7 @@ def _solved_badge(setting: SettingRecord) -> tuple[str, str] | None:
         return None
     num_seeds = len(setting.scores)
     kind = "good" if setting.num_solved == num_seeds else "" if setting.num_solved else "bad"
-    return (f"solved with {setting.num_solved:,} of {counted(num_seeds, 'seed')}", kind)
+    return (f"solved in training with {setting.num_solved:,} of {counted(num_seeds, 'seed')}", kind)
 
 
 def why_no_best(trials: Sequence[TrialRecord], place: str) -> tuple[str, str]:

@@ -64,7 +64,7 @@ def test_the_setting_stands_beside_the_policy(typical: Made, tmp_path: Path) -> 
     assert f"How sure {certainty(settings)}" in page.words
     (score,) = re.findall(r"in the later half of training; 95 % interval (\S+) to \S+, over training seeds", page.words)
     assert score == f"{settings.best.lower:.1f}"
-    badge = f"solved with {settings.best.num_solved} of 5 seeds"
+    badge = f"solved in training with {settings.best.num_solved} of 5 seeds"
     assert badge in page.words
     one = make_sweep(points=make_points(1, np.random.default_rng(0))[:1])
     assert "Setting to train with" not in report(tmp_path / "one", one)[2].words
