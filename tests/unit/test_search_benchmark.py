@@ -13,8 +13,10 @@ import pytest
 
 from tests.benchmarks.search import envs
 from tests.benchmarks.search import trainings as module
+from tests.benchmarks.search.__main__ import DATA
 from tests.benchmarks.search.pack_trainer import ENVS
 from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run, run_all
+from tests.benchmarks.search.same_task import AnotherTaskError, check_same_task
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
 from tests.benchmarks.search.trainings import Trainings, Wanted
@@ -112,6 +114,27 @@ def test_no_training_is_made_twice_whenever_the_benchmark_is_killed(
     assert {name: item for name, item in found.items() if name[1] == 0} == {
         ("random", 0): played("random", 0)[0], ("tpe", 0): played("tpe", 0)[0],
     }  # fmt: skip
+
+
+def test_trainings_of_another_task_file_are_not_taken_for_those_of_this(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "edited.yaml"
+    file.write_text(TASK.file.read_text())
+    monkeypatch.setattr(Task, "file", file)
+    for _ in range(2):
+        check_same_task(TASK, tmp_path)
+    file.write_text(
+        file.read_text().replace("CartPole-v1, 100,000", "another title").replace("gamma: 0.99", "gamma: 0.9")
+    )
+    with pytest.raises(AnotherTaskError, match=r"hyperparams is .*'gamma': 0\.9,.*, was .*'gamma': 0\.99,.* remove"):
+        check_same_task(TASK, tmp_path)
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_the_data_of_every_task_are_of_its_task_file(task: Task) -> None:
+    assert (DATA / f"{task.name}.task.json").exists()
+    check_same_task(task, DATA)
 
 
 @pytest.mark.parametrize(("wanted", "sizes"), [(1, [1]), (3, [1, 2]), (48, [24, 24]), (60, [15] * 4)])

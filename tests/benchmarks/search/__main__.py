@@ -16,6 +16,7 @@ from typing import Any
 
 from tests.benchmarks.ppo import machine_name
 from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, finite, run_all
+from tests.benchmarks.search.same_task import AnotherTaskError, check_same_task
 from tests.benchmarks.search.schedulers import SCHEDULERS
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import HERE, TASKS
@@ -77,6 +78,10 @@ def main() -> None:
     # Packs use a core each, and their processes take this from here.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for name in options.tasks or TASKS:
+        try:
+            check_same_task(TASKS[name], DATA)
+        except AnotherTaskError as error:
+            raise SystemExit(f"error: {error}") from None
         if not options.tables:
             trainings = Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)
             choosing = [method for method in options.methods if method in METHODS]

@@ -31,10 +31,15 @@ class Task:
     published: dict[str, float]
     """The mean over five runs of the best point's score, by method."""
 
+    @property
+    def file(self) -> Path:
+        """Its sweep file."""
+        return HERE / "tasks" / f"{self.name}.yaml"
+
     @cached_property
     def spec(self) -> SweepSpec:
         """The sweep."""
-        return load_spec(HERE / "tasks" / f"{self.name}.yaml")
+        return load_spec(self.file)
 
     def with_spec(self, spec: SweepSpec) -> Task:
         """Return this task with another sweep."""
