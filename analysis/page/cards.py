@@ -23,6 +23,8 @@ from analysis.statistics import mean_with_ci, paired_difference
 from analysis.wording import counted, return_text, shown_path
 from policies import random_streams
 from policies.acting.movies import still_of
+from policies.errors import CheckpointError, NotFoundError
+from policies.portable.file import read_policy
 
 _NUMBERS = ("episodes", "score")
 _MAX_AVERAGED = 1e150
@@ -146,12 +148,24 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
         "optimism_gap": best.optimism_gap,
         "evaluate_command": f"tune-jobs evaluate {shlex.quote(policy)}",
         "load_code": "from tune_jobs import load_policy\n\n"
-        f"policy = load_policy({policy!r})\naction = policy.act(observation)",
+        f"policy = load_policy({policy!r})\n{acting_code(Path(place, 'best'))}",
         "stale": not is_current(best, trials),
         "chosen_from": "" if choice is None else chosen_from(choice),
         "candidates": candidate_table(best),
         "choice_note": "" if choice is None else choice.note,
     }
+
+
+def acting_code(folder: Path) -> str:
+    """Return how the policy in a folder acts, as Python: with a mask beside the observation if it takes one so."""
+    try:
+        needs_mask = read_policy(folder).needs_mask
+    except (CheckpointError, NotFoundError):
+        # It is in an object store, or not written yet.
+        needs_mask = False
+    if needs_mask:
+        return 'action = policy.act(observation, mask=info["action_mask"])  # or where the environment has its mask'
+    return "action = policy.act(observation)"
 
 
 def setting_card(source: Source) -> SettingCard | None:

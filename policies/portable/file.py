@@ -67,6 +67,12 @@ class PortablePolicy:
     training: dict[str, Any] = field(default_factory=dict)
     """Free metadata on its training, such as trial id, iteration, hyperparameters and seed; not needed to act."""
 
+    @property
+    def needs_mask(self) -> bool:
+        """Whether it is told beside an observation which actions are allowed, as the observation does not tell."""
+        mask = self.observation_space.get("mask")
+        return isinstance(mask, dict) and mask.get("key") is None
+
 
 def save_policy(
     policy: PortablePolicy,

@@ -13,6 +13,7 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from analysis.page.cards import acting_code
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.evaluate import Evaluator, evaluate_policy
 from policies.acting.live import watch_episode
@@ -58,6 +59,14 @@ def policy_of(hyperparams: TrainedHyperparams, env_args: dict[str, Any], folder:
     policy = load_policy(folder)
     assert isinstance(policy, NetworkPolicy)
     return policy
+
+
+@pytest.mark.parametrize(("place", "given"), [("observation", ""), ("method", ", mask="), ("info", ", mask=")])
+def test_the_report_says_how_to_act_with_a_mask(tmp_path: Path, place: str, given: str) -> None:
+    policy_of(PPO, PLACES[place], tmp_path / "best")
+    assert f"policy.act(observation{given}" in acting_code(tmp_path / "best")
+    assert acting_code(tmp_path / "best").endswith("(observation)") is (given == "")
+    assert acting_code(tmp_path / "nothing") == "action = policy.act(observation)"
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -10,6 +10,7 @@ import argparse
 import json
 import os
 import platform
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -83,9 +84,9 @@ def main() -> None:
         except AnotherTaskError as error:
             raise SystemExit(f"error: {error}") from None
         if not options.tables:
-            trainings = Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)
             choosing = [method for method in options.methods if method in METHODS]
-            keep(name, run_all(TASKS[name], trainings, choosing, options.runs))
+            with closing(Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)) as trainings:
+                keep(name, run_all(TASKS[name], trainings, choosing, options.runs))
             whole = WholeRuns(TASKS[name], DATA / f"{name}.whole.jsonl", options.processes)
             looking = [method for method in options.methods if method in SCHEDULERS]
             keep(name, whole.runs(looking, options.runs))

@@ -67,6 +67,12 @@ class Trainings:
             self._make(missing)
         yield from (self._known[item.key] for item in wanted)
 
+    def close(self) -> None:
+        """End the processes that train."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
     def _packs(self, missing: Sequence[Wanted]) -> list[list[Wanted]]:
         """Divide trainings among packs of nearly one size: those that can share a stack stand side by side."""
         ordered = sorted(missing, key=lambda item: repr(pack_key(point_hyperparams(self._task.spec, item.point, 0))))
