@@ -139,7 +139,7 @@ class StackedNetworks:
             if number or num:
                 _set_gradients(gradients[number], x, gradient)
             else:
-                torch.bmm(x.transpose(1, 2), gradient, out=gradients[0])
+                _product_of_rows(x, gradient, gradients[0])
         if num:
             gradient = torch.bmm(gradient, dense[0][:, :-1].transpose(1, 2))
             self._stacked.backward(gradient, self.layers[:num], self.gradient_layers[:num])
@@ -157,11 +157,16 @@ def _product(x: Tensor, layer: Tensor) -> Tensor:
 
 
 def _set_gradients(views: Tensor, x: Tensor, gradient: Tensor) -> None:
-    if _is_narrow(views):
-        np.matmul(x.numpy().swapaxes(1, 2), gradient.numpy(), out=views.numpy()[:, :-1])
-    else:
-        torch.bmm(x.transpose(1, 2), gradient, out=views[:, :-1])
+    _product_of_rows(x, gradient, views[:, :-1])
     torch.sum(gradient, dim=1, out=views[:, -1])
+
+
+def _product_of_rows(x: Tensor, gradient: Tensor, out: Tensor) -> None:
+    """Write the gradients of a matrix, shape (K, inputs, outputs), from its inputs and the gradients of its outputs."""
+    if _is_narrow(out):
+        np.matmul(x.numpy().swapaxes(1, 2), gradient.numpy(), out=out.numpy())
+    else:
+        torch.bmm(x.transpose(1, 2), gradient, out=out)
 
 
 def _is_narrow(layer: Tensor) -> bool:
@@ -170,7 +175,7 @@ def _is_narrow(layer: Tensor) -> bool:
     It takes a seventh of torch's time for 2 outputs on some CPUs, and no less on any; and each network's product is one
     of its own, so that it rounds alike wherever the network is in the stack.
     """
-    return layer.shape[2] < _NARROW and layer.device.type == "cpu"
+    return min(layer.shape[1:]) < _NARROW and layer.device.type == "cpu"
 
 
 def with_ones(x: Floats) -> Floats:

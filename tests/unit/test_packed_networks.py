@@ -372,3 +372,22 @@ def test_every_layer_of_every_network_begins_at_a_cache_line() -> None:
     for layers in (networks.layers, networks.gradient_layers):
         assert [tuple(layer.shape[1:]) for layer in layers] == [(4, 5), (6, 7), (8, 2)]
         assert {layer[row].data_ptr() % 64 for layer in layers for row in range(3)} == {0}
+
+
+@pytest.mark.parametrize("num_outputs", [1, 2, 3, 5, 6, 15])
+def test_what_a_network_computes_does_not_depend_on_its_place_in_the_stack(num_outputs: int) -> None:
+    rng = torch.Generator().manual_seed(num_outputs)
+    stack, alone = (StackedNetworks(number, (9, 32, 32, num_outputs), "relu") for number in (5, 1))
+    stack.weights.normal_(generator=rng)
+    for num_rows in (32, 33, 128):
+        x, gradient = (torch.randn(5, num_rows, number, generator=rng) for number in (10, num_outputs))
+        outputs = stack.forward(x)
+        stack.backward(gradient)
+        for place in range(5):
+            one = slice(place, place + 1)
+            alone.weights.copy_(stack.weights[one])
+            assert torch.equal(alone.forward(x[one]), outputs[one])
+            assert torch.equal(alone.evaluate(x[one], 0, 1), outputs[one])
+            alone.backward(gradient[one])
+            assert torch.equal(alone.gradients, stack.gradients[one])
+        assert torch.equal(stack.evaluate(x[1:4], 1, 4), outputs[1:4])
