@@ -30,6 +30,7 @@ Floats = NDArray[np.float32]
 # what a network computes would depend on its place in the stack.
 _LINE = 16
 _NARROW = 16
+"""A layer of fewer inputs or outputs is multiplied by NumPy, see `_is_narrow`; from there on torch is about as fast."""
 
 
 def _whole_lines(num_weights: int) -> int:

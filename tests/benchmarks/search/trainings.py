@@ -68,9 +68,9 @@ class Trainings:
         yield from (self._known[item.key] for item in wanted)
 
     def close(self) -> None:
-        """End the processes that train."""
+        """End the processes that train, and begin no pack that waits."""
         if self._pool is not None:
-            self._pool.shutdown()
+            self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
     def _packs(self, missing: Sequence[Wanted]) -> list[list[Wanted]]:
