@@ -6,6 +6,7 @@ The same sweep runs on all of them; only joining Ray, and checking the nodes (`n
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import signal
@@ -98,9 +99,26 @@ def connect(
             yield Connection(address, is_client(), cluster_machine(source))
         finally:
             # A Ray that is shut down only in part would block the next one, and its processes would live on.
-            with current().shielded():
+            with current().shielded(), _not_collecting():
                 ray.shutdown()
                 logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _not_collecting() -> Iterator[None]:
+    """Let no thread collect garbage in the block.
+
+    While Ray 2.60 shuts down, its native code ends the process at once, without a word, if an object reference is freed
+    after its worker is gone and before Python has forgotten it. Ray Tune leaves such references in cycles, and another
+    thread, such as one that imports modules, may be in that gap when a collection is due.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @contextlib.contextmanager
