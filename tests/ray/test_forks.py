@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 from policies.parents import is_gone
 from tune_jobs.ray_tune import forked_worker
-from tune_jobs.ray_tune.forking import fork_server
+from tune_jobs.ray_tune.forks import begun_ahead, fork_server
 
 pytestmark = [pytest.mark.ray, pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")]
 
@@ -69,7 +70,7 @@ def asked(folder: Path, address: str, *options: str, **environment: str) -> dict
 def address() -> Iterator[str]:
     with fork_server() as found:
         assert found is not None
-        yield found
+        yield found.address
 
 
 def test_a_fork_is_what_the_command_would_have_become(address: str, tmp_path: Path) -> None:
@@ -104,7 +105,7 @@ def test_ray_starts_its_processes_itself_where_nobody_answers(tmp_path: Path) ->
 def test_forked_processes_end_with_the_one_that_they_are_forked_from(tmp_path: Path) -> None:
     with fork_server() as found:
         assert found is not None
-        me = asked(tmp_path, found)["me"]
+        me = asked(tmp_path, found.address)["me"]
         assert not is_gone(me)
     until = time.monotonic() + 10
     while not is_gone(me):
@@ -112,12 +113,79 @@ def test_forked_processes_end_with_the_one_that_they_are_forked_from(tmp_path: P
         time.sleep(0.05)
 
 
+def children() -> list[Path]:
+    """What the kernel tells of each process that this one has started."""
+    pids = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return [Path("/proc", pid) for pid in pids]
+
+
+def test_ray_is_loaded_before_a_process_is_asked_for_where_one_was_announced(tmp_path: Path) -> None:
+    before = children()
+    with fork_server() as found:
+        assert found is not None
+        (process,) = (each for each in children() if each not in before)
+        found.announce({**os.environ, "RAY_RAYLET_PID": "7", "RAY_that_of_this_node": "1"})
+        until = time.monotonic() + 60
+        while "/_raylet.so" not in (process / "maps").read_text():
+            assert time.monotonic() < until, "Ray is not loaded"
+            time.sleep(0.05)
+        of_this_node = asked(tmp_path, found.address, RAY_that_of_this_node="1", RAY_RAYLET_PID="7")
+        assert of_this_node["loaded"] == ["torch", "ray", "tune_jobs.ray_tune.pack_trainable"]
+        # The environment that was announced is the one that counts.
+        assert asked(tmp_path, found.address) == {}
+
+
+def test_who_has_ended_is_announced_nothing() -> None:
+    with fork_server() as found:
+        assert found is not None
+        found.close()
+        found.announce({})
+
+
+def test_one_that_was_begun_ahead_is_the_one_that_is_used_and_lives_as_long(tmp_path: Path) -> None:
+    before = children()
+    with begun_ahead(wanted=True):
+        begun = [each for each in children() if each not in before]
+        assert len(begun) == 1
+        with begun_ahead(wanted=True):  # a sweep's own, within that of who launches it
+            assert [each for each in children() if each not in before] == begun
+        with fork_server() as found:
+            assert found is not None
+            assert [each for each in children() if each not in before] == begun
+            assert asked(tmp_path, found.address)["loaded"]
+        assert children() == before
+        with fork_server() as another:
+            assert another is not None
+            assert another.address != found.address
+    assert children() == before
+
+
+def test_one_that_was_begun_ahead_and_is_not_used_ends_at_once_and_leaves_no_folder() -> None:
+    before = children()
+
+    def folders() -> set[Path]:
+        return set(Path(tempfile.gettempdir()).glob("tune-jobs-fork-*"))
+
+    others = folders()
+    with begun_ahead(wanted=True):
+        begun = [each for each in children() if each not in before]
+        assert len(folders() - others) == len(begun) == 1
+    assert not begun[0].exists()
+    assert folders() <= others
+
+
+def test_none_is_begun_ahead_where_none_is_wanted() -> None:
+    before = children()
+    with begun_ahead(wanted=False):
+        assert children() == before
+
+
 def test_a_killed_driver_leaves_no_folder() -> None:
     script = """
 import sys
-from tune_jobs.ray_tune.forking import fork_server
+from tune_jobs.ray_tune.forks import begun_ahead, fork_server
 with fork_server() as found:
-    print(found, flush=True)
+    print(found.address, flush=True)
     sys.stdin.read()
 """
     with subprocess.Popen(
@@ -133,14 +201,28 @@ with fork_server() as found:
         time.sleep(0.1)
 
 
-def test_a_local_ray_has_its_processes_forked() -> None:
+def test_a_local_ray_has_its_processes_forked_and_its_node_noticed() -> None:
     # In a process of its own, as this one may have joined a Ray.
     script = """
-import os
+import os, threading
 from pathlib import Path
 import ray
+from ray._private import services, state
 from tune_jobs.plan.machine import Machine
 from tune_jobs.ray_tune.cluster import connect
+
+def meanwhile():
+    print("meanwhile", threading.current_thread() is threading.main_thread(), ray.is_initialized())
+
+of_ray = services.get_node
+
+def get_node(address, node):
+    known = state.GlobalState()
+    known._initialize_global_state(services._get_gcs_client_options(address))
+    print("the node is there", node in [each["NodeID"] for each in known.node_table()])
+    return of_ray(address, node)
+
+services.get_node = get_node
 
 @ray.remote(num_cpus=1)
 class Asked:
@@ -148,7 +230,7 @@ class Asked:
         parent = Path(f"/proc/{os.getppid()}/cmdline").read_text()
         return parent.split("\\0")[1], ray.get_runtime_context().get_job_id()
 
-with connect(None, Machine(num_cpus=1, num_gpus=0)):
+with connect(None, Machine(num_cpus=1, num_gpus=0), meanwhile=meanwhile):
     # The first process was started before there was a job, the second for it.
     for _ in range(2):
         actor = Asked.remote()
@@ -159,4 +241,7 @@ with connect(None, Machine(num_cpus=1, num_gpus=0)):
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False, timeout=240
     )
     program = str(ROOT / "tune_jobs" / "ray_tune" / "fork_server.py")
-    assert done.stdout.splitlines() == [f"{program} 01000000"] * 2, done.stderr
+    first, second, *asked_whom = done.stdout.splitlines()
+    assert asked_whom == [f"{program} 01000000"] * 2, done.stderr
+    # Ray looks for its node once a second: it is asked when there is one.
+    assert (first, second) == ("meanwhile True False", "the node is there True")

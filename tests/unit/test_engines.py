@@ -17,7 +17,7 @@ from policies.acting.evaluate import Evaluator
 from policies.errors import CheckpointError, SpecError
 from tests.narrowing import present
 from tune_jobs import restore
-from tune_jobs.plan.engine_choice import choose_engines
+from tune_jobs.plan.engine_choice import choose_engines, may_pack
 from tune_jobs.spec import engines
 from tune_jobs.spec.engines import ENGINES, Engine, engine_on_record
 from tune_jobs.spec.file import load_spec
@@ -169,3 +169,17 @@ def test_a_manifest_of_before_is_told_by_what_its_folder_holds(tmp_path: Path, n
     (folder / name).rename(folder / "something")
     with pytest.raises(CheckpointError, match="does not hold the state of any engine"):
         engine_of_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("changed", "may"),
+    [
+        ({}, True),
+        ({"algorithm": "dqn"}, True),
+        ({"engine": "packed"}, True),
+        ({"engine": "rllib"}, False),
+        ({"algorithm": "random", "space": {}}, False),
+    ],
+)
+def test_a_file_tells_whether_trials_may_be_packed(changed: dict[str, Any], may: bool) -> None:
+    assert may_pack(load_spec(MINIMAL | changed)) is may

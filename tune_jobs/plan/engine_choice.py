@@ -88,6 +88,12 @@ def pack_key(hyperparams: Hyperparams) -> tuple[Any, ...]:
     return key
 
 
+def may_pack(spec: SweepSpec) -> bool:
+    """Whether trials of a sweep may be packed, as far as its file tells."""
+    able = (engine for engine in engines_for(spec.algorithm) if spec.engine in ("auto", engine.name))
+    return any(engine.trains_many and why_none(engine, spec) is None for engine in able)
+
+
 def why_not(
     engine: Engine, spec: SweepSpec, hyperparams: Hyperparams | None = None, env: EnvInfo | None = None
 ) -> str | None:

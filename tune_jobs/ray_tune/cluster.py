@@ -12,7 +12,7 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from tune_jobs.ray_tune.connected_ray import (
     of_a_sweep,
 )
 from tune_jobs.ray_tune.environment import prepare_environment
-from tune_jobs.ray_tune.forking import fork_server
+from tune_jobs.ray_tune.forks import ForkServer, fork_server
 from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, start, without_environments
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
@@ -53,7 +53,12 @@ class Connection:
 
 @contextlib.contextmanager
 def connect(
-    address: str | None, machine: Machine | None = None, *, is_users: bool = False, packs: bool = True
+    address: str | None,
+    machine: Machine | None = None,
+    *,
+    is_users: bool = False,
+    packs: bool = True,
+    meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[Connection]:
     """Join a cluster, or start Ray on this machine, for the duration of the block.
 
@@ -64,6 +69,7 @@ def connect(
         machine: The CPUs and GPUs to start Ray with on this machine.
         is_users: Whether the connection stands for one that the caller has in another process.
         packs: Whether packs are trained, whose processes a Ray of this machine forks then (see `forking`).
+        meanwhile: What to do while a Ray of this machine starts, for which there is nothing to do but wait.
 
     Raises:
         CannotRunError: Nothing answers at the address, its Ray differs, Ray does not start, or the caller is connected
@@ -74,7 +80,7 @@ def connect(
         check_connected_to(address)
         yield Connection(address, is_client(), connected_machine())
         return
-    forks: str | None = None
+    forks: ForkServer | None = None
     logger = logging.getLogger("ray")
     level = logger.level
     with contextlib.ExitStack() as stack:
@@ -88,7 +94,7 @@ def connect(
         try:
             with ending_if_it_fails(), _keeping_sigterm(), _deaf_to_hangups():
                 if address is None:
-                    start(machine, forks)
+                    start(machine, forks, meanwhile)
                     stack.enter_context(without_environments())
                 else:
                     # One that a sweep's process started here for its others: a cluster's nodes are elsewhere.

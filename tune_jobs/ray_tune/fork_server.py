@@ -18,6 +18,7 @@ if __name__ == "__main__":
 import array
 import contextlib
 import ctypes
+import gc
 import importlib
 import json
 import os
@@ -43,7 +44,7 @@ def main(listener: socket.socket, early: list[str], late: list[str]) -> Callable
         listener: Where is asked.
         early: What is imported at once, none of which may import Ray. A module that can't be imported is left to the
             processes that need it.
-        late: What is imported when the first process asks.
+        late: What is imported when the first process asks, or when it is announced.
 
     Returns:
         In a forked process, what it does; None: there is nothing left to do in this one.
@@ -51,6 +52,9 @@ def main(listener: socket.socket, early: list[str], late: list[str]) -> Callable
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         # The driver ends this process. The forked ones do with signals what those do that Ray starts.
         signal.signal(number, signal.SIG_IGN)
+    # What is imported stays. Looking through it for garbage takes a sixth of the time of importing it, and would have
+    # each forked process write to memory that it shares with this one.
+    gc.disable()
     _import("tune_jobs", *early)
     kernel = ctypes.CDLL(None)
     # What has ended needs nobody who asks how.
@@ -70,9 +74,11 @@ def main(listener: socket.socket, early: list[str], late: list[str]) -> Callable
                 if not _draws_differ():
                     # A Ray of another version: it starts its processes itself.
                     return None
+                gc.freeze()
             pid = -1
-            # Those who ask with other settings, or wait no more, become Ray's own command.
-            if _settings_of_ray(asked) == known and not select.select([connection], [], [], 0)[0]:
+            # Nothing is forked for what is announced. Those who ask with other settings, or wait no more, become Ray's
+            # own command.
+            if "command" in asked and _settings_of_ray(asked) == known and _is_waiting(connection):
                 pid = _fork(kernel)
             if pid == 0:
                 listener.close()
@@ -82,6 +88,10 @@ def main(listener: socket.socket, early: list[str], late: list[str]) -> Callable
                 os.close(stream)
             if pid > 0:
                 connection.sendall(str(pid).encode())
+
+
+def _is_waiting(connection: socket.socket) -> bool:
+    return not select.select([connection], [], [], 0)[0]
 
 
 def _fork(kernel: ctypes.CDLL) -> int:
@@ -176,6 +186,7 @@ def _work(asked: Mapping[str, Any], streams: list[int]) -> None:
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
         os.close(stream)
+    gc.enable()
     _take_over_signals(asked)
     os.chdir(asked["folder"])
     os.environ.clear()

@@ -10,7 +10,8 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +22,27 @@ from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.ray_tune.environment import provide_token
 from tune_jobs.ray_tune.forking import forked_workers
+from tune_jobs.ray_tune.forks import ForkServer
 from tune_jobs.ray_tune.replaced import replaced
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
+# Ray 2.60's processes ask a second later where a socket is not there yet, which the raylet's own may not be.
+_SYSTEM = {"raylet_client_connect_timeout_milliseconds": 20, "raylet_client_num_connect_attempts": 500}
 QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
 """What `ray.init` is told, so that it prints nothing."""
 
 
-def start(machine: Machine | None, forks: str | None = None) -> None:
+def start(
+    machine: Machine | None, forks: ForkServer | None = None, meanwhile: Callable[[], object] | None = None
+) -> None:
     """Start a Ray of this machine and join it.
 
     Args:
         machine: The CPUs and GPUs to start it with; None: all that Ray finds.
-        forks: Where its processes are forked (see `forking`); None: it starts them itself.
+        forks: From which its processes are forked (see `forking`); None: it starts them itself.
+        meanwhile: What to do while its processes start, in this thread: two that import parts of Ray at once may see
+            modules half done.
 
     Raises:
         CannotRunError: Ray does not start.
@@ -51,11 +59,17 @@ def start(machine: Machine | None, forks: str | None = None) -> None:
             _without_unused_processes(),
             without_dashboards_agent(),
             forked_workers(forks),
+            _noticing_its_node(meanwhile),
             at_loopback(),
         ):
             # "local": a cluster of this sweep's own, even if another one runs already.
             ray.init(
-                address="local", include_dashboard=False, object_store_memory=_OBJECT_STORE_BYTES, **resources, **QUIET
+                address="local",
+                include_dashboard=False,
+                object_store_memory=_OBJECT_STORE_BYTES,
+                _system_config=_SYSTEM,
+                **resources,
+                **QUIET,
             )
     except Exception as error:
         raise CannotRunError(
@@ -73,6 +87,35 @@ def at_loopback() -> Iterator[None]:
     such a Ray has to do so too.
     """
     with replaced(ray._private.ray_constants, "ENABLE_RAY_CLUSTER", value=False):  # noqa: SLF001
+        yield
+
+
+_NODES_PATIENCE_S = 10.0
+_POLL_S = 0.02
+
+
+@contextlib.contextmanager
+def _noticing_its_node(meanwhile: Callable[[], object] | None) -> Iterator[None]:
+    """Let a Ray that is started in the block notice at once that its node is there.
+
+    Ray 2.60's native code looks once a second, and a node is there after less.
+    """
+    services: Any = ray._private.services  # noqa: SLF001
+    original = services.get_node
+
+    def get_node(gcs_address: str, node_id: str) -> Any:
+        if meanwhile is not None:
+            meanwhile()
+        # Where it can't be asked so, Ray's own way says why.
+        with contextlib.suppress(Exception):
+            state: Any = ray._private.state.GlobalState()  # noqa: SLF001
+            state._initialize_global_state(services._get_gcs_client_options(gcs_address))  # noqa: SLF001
+            until = time.monotonic() + _NODES_PATIENCE_S
+            while time.monotonic() < until and all(node["NodeID"] != node_id for node in state.node_table()):
+                time.sleep(_POLL_S)
+        return original(gcs_address, node_id)
+
+    with replaced(services, "get_node", get_node):
         yield
 
 
@@ -101,8 +144,8 @@ _AGENT = "--dashboard_agent_command="
 def without_dashboards_agent() -> Iterator[None]:
     """Let `idle_agent` take the place of the dashboard's agent in a Ray that is started in the block.
 
-    The raylet waits for it before it starts the first process, for most of a second of CPU time. Nothing public of Ray
-    2.60 leaves it out.
+    Ray loads what the agent needs to see whether it is there, which takes a third of a second, and the raylet waits for
+    it before it starts the first process, for most of a second of CPU time. Nothing public of Ray 2.60 leaves it out.
     """
     services: Any = ray._private.services  # noqa: SLF001
     original = services.start_ray_process
@@ -110,7 +153,13 @@ def without_dashboards_agent() -> Iterator[None]:
     def start(command: list[str], *args: Any, **kwargs: Any) -> Any:
         return original([_of_an_idle_agent(part) for part in command], *args, **kwargs)
 
-    with replaced(services, "start_ray_process", start):
+    def no_error() -> None:
+        return None
+
+    with (
+        replaced(services, "start_ray_process", start),
+        replaced(ray._private.utils, "get_dashboard_dependency_error", no_error),  # noqa: SLF001
+    ):
         yield
 
 

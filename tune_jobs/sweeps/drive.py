@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import math
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from analysis.records import FINISHED, SweepRecord, SweepState
 from policies.errors import CannotRunError, TuneJobsError
-from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.plan.engine_choice import PackPlan, may_pack
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
@@ -85,7 +86,27 @@ def connected(address: str | None, here: Machine | None, *, packs: bool = False)
         check_address(address)
     from tune_jobs.ray_tune.cluster import connect
 
-    return connect(address, here, packs=packs)
+    return connect(address, here, packs=packs, meanwhile=_import_what_runs_trials)
+
+
+def _import_what_runs_trials() -> None:
+    """Import Ray Tune and what is built on it. What can't be imported is an error where it is needed."""
+    with contextlib.suppress(Exception):
+        importlib.import_module("tune_jobs.ray_tune.run_trials")
+
+
+def packs_begun_ahead(spec: SweepSpec, here: Machine | None) -> AbstractContextManager[None]:
+    """Let the process from which packs are forked import what they need while the block plans a sweep.
+
+    Args:
+        spec: The sweep, of which something is left to train.
+        here: This machine, if Ray will be started here.
+    """
+    from tune_jobs.ray_tune.forks import begun_ahead
+
+    # As `cluster.connect` asks for one.
+    wanted = here is not None and not here.num_gpus and not _has_joined_ray() and may_pack(spec)
+    return begun_ahead(wanted=wanted)
 
 
 def machine_here() -> Machine:
@@ -106,10 +127,14 @@ def address_of_users_ray() -> str | None:
     return address_for_others()
 
 
-def _is_connected_by_user() -> bool:
+def _has_joined_ray() -> bool:
     ray: Any = sys.modules.get("ray")
     # While another thread imports ray, it has no such function yet.
-    if ray is None or not getattr(ray, "is_initialized", bool)():
+    return ray is not None and bool(getattr(ray, "is_initialized", bool)())
+
+
+def _is_connected_by_user() -> bool:
+    if not _has_joined_ray():
         return False
     from tune_jobs.ray_tune.connected_ray import is_of_a_sweep
 
@@ -237,18 +262,6 @@ def _run_trials(
             monitor.phase = "starting Ray" if address is None else f"joining the Ray cluster at {address}"
             stack.enter_context(shown(monitor, progress, store.driver_log, plan.notes))
             shared.is_shown = True
-        from tune_jobs.ray_tune.run_trials import RunJob, run_trials
-
-        job = RunJob(
-            store.place,
-            todo,
-            plan.cpus_per_trial,
-            plan.gpus_per_trial,
-            plan.max_concurrent if address is None else most_at_once(store, plan.max_concurrent, num_trials=len(todo)),
-            packs=plan.packs,
-            more_packs=0 if address is None else packs_for_more_nodes(store, plan.packs),
-            run=run.token,
-        )
 
         def ask() -> None:
             monitor.stopping = True
@@ -257,6 +270,19 @@ def _run_trials(
         with current().asking(ask):
             if shared.connection is None:
                 shared.connection = stack.enter_context(connected(address, machine, packs=plan.packs is not None))
+            from tune_jobs.ray_tune.run_trials import RunJob, run_trials
+
+            most = plan.max_concurrent
+            job = RunJob(
+                store.place,
+                todo,
+                plan.cpus_per_trial,
+                plan.gpus_per_trial,
+                most if address is None else most_at_once(store, most, num_trials=len(todo)),
+                packs=plan.packs,
+                more_packs=0 if address is None else packs_for_more_nodes(store, plan.packs),
+                run=run.token,
+            )
             monitor.phase = "starting the trials"
             try:
                 if shared.connection.is_client:

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ParamSpec
 
-from analysis.records import ReplicationRecord
+from analysis.records import FINISHED, ReplicationRecord
 from policies.envs.modules import allow_modules
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine
@@ -15,7 +15,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
-from tune_jobs.sweeps.drive import connected, machine_here, settled
+from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.own_job import note_own_job
 from tune_jobs.sweeps.stages import RACE, MoreSeeds, run_sweep
@@ -57,7 +57,8 @@ def go_on(
         SpecError: The space has nothing to draw more samples from, or the point is wrong or known.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
-    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where, notes):
+    more = bool(num_samples) or point is not None or retry_failed
+    with _taken_over(store, address, wait_for_nodes, progress, more=more) as (machine, where, notes):
         record = store.read_record()
         spec = stored_spec(record)
         if num_samples:
@@ -94,7 +95,7 @@ def replicate(
         SpecError: The sweep cannot be replicated.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
-    with _taken_over(store, address, wait_for_nodes, progress) as (machine, where, notes):
+    with _taken_over(store, address, wait_for_nodes, progress, more=True) as (machine, where, notes):
         record = store.read_record()
         spec = stored_spec(record)
         check_replicable(spec)
@@ -105,9 +106,9 @@ def replicate(
 
 @contextlib.contextmanager
 def _taken_over(
-    store: Sweep, address: str | None, wait_for_nodes: float, progress: str
+    store: Sweep, address: str | None, wait_for_nodes: float, progress: str, *, more: bool
 ) -> Iterator[tuple[Machine | None, Machine, tuple[str, ...]]]:
-    """Hold the sweep's lock for the block.
+    """Hold the sweep's lock for the block; `more` trials than those that are not finished may come to the sweep in it.
 
     It gives the machine to start Ray on, if any, what the sweep runs on, and notes on its nodes.
     """
@@ -122,6 +123,8 @@ def _taken_over(
         machine = machine_here() if address is None else None
         if machine is not None:
             note_wait(store, None)
+            if more or any(trial.status not in FINISHED for trial in store.read_trials()):
+                stack.enter_context(packs_begun_ahead(stored_spec(store.read_record()), machine))
             yield machine, machine, ()
             return
         connection = stack.enter_context(connected(address, None))
