@@ -7,12 +7,14 @@ the other, each with the program that the report offers for the trial's setting.
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import multiprocessing
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,11 +82,12 @@ WORKS = {
 }  # fmt: skip
 
 
-def train(work: Work, lrs: list[float], queue: Any) -> None:
-    """Train trials with Stable-Baselines3, one after the other; puts the seconds in `learn` of each into the queue."""
+def train(work: Work, lrs: list[float]) -> list[float]:
+    """Train trials with Stable-Baselines3, one after the other, and return the seconds in `learn` of each."""
     import torch
 
     torch.set_num_threads(1)
+    seconds: list[float] = []
     for lr in lrs:
         hyperparams = make_hyperparams(work.algorithm, {**work.hyperparams, "lr": lr})
         assert isinstance(hyperparams, PPOHyperparams | DQNHyperparams)
@@ -97,23 +100,20 @@ def train(work: Work, lrs: list[float], queue: Any) -> None:
         exec(making, names)
         start = time.perf_counter()
         exec(training, names)
-        seconds = time.perf_counter() - start
+        seconds.append(time.perf_counter() - start)
         assert names["model"].num_timesteps >= work.num_env_steps
-        queue.put(seconds)
+    return seconds
 
 
 def train_shares(work: Work) -> list[float]:
-    """Train all trials in a process a core, and return the seconds in `learn` of each."""
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
+    """Train all trials in a process a core, and return the seconds in `learn` of each.
+
+    What fails in one of the processes is raised here.
+    """
     shares = [work.lrs[number :: workload.NUM_CPUS] for number in range(workload.NUM_CPUS)]
-    processes = [context.Process(target=train, args=(work, share, queue)) for share in shares]
-    for process in processes:
-        process.start()
-    seconds = [queue.get() for _ in work.lrs]
-    for process in processes:
-        process.join()
-    return seconds
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workload.NUM_CPUS, mp_context=spawn) as processes:
+        return list(itertools.chain.from_iterable(processes.map(functools.partial(train, work), shares)))
 
 
 def rows(repeats: int) -> list[Row]:
