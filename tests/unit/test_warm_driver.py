@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import time
+import threading
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from policies.errors import CannotRunError
 from policies.guard.guard import guarding
 from tune_jobs.service.driver import warm_up
 
@@ -22,7 +24,7 @@ def _settings(folder: Path, *, warm: bool) -> dict[str, Any]:
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("tune_jobs.ray_tune.warm.warm_ray", lambda _: contextlib.nullcontext())
+    monkeypatch.setattr("tune_jobs.ray_tune.warm.warm_ray", lambda *_: contextlib.nullcontext())
     # The tests share one process for environments; a driver has its own.
     monkeypatch.setattr("policies.guard.guard._current", ContextVar("guard", default=None))
     monkeypatch.chdir(tmp_path)
@@ -41,17 +43,30 @@ def test_a_sweeps_environments_find_their_process_there_and_it_ends_with_the_dri
     assert "tune_jobs.ray_tune.run_trials" in sys.modules
 
 
-def test_it_is_warm_only_when_all_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("starts", [True, False])
+def test_all_is_imported_while_ray_starts_and_where_it_does_not(
+    starts: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done: list[str] = []
 
-    def import_slowly() -> None:
-        time.sleep(0.5)
-        done.append("all")
+    @contextlib.contextmanager
+    def ray(_: object, meanwhile: Callable[[], object]) -> Iterator[None]:
+        if not starts:
+            raise CannotRunError("There is no room.", "Make some.")
+        done.append("starting")
+        meanwhile()
+        done.append("started")
+        yield
 
-    monkeypatch.setattr("tune_jobs.service.driver._import_all", import_slowly)
+    # In a thread of its own it would see modules of Ray half done.
+    monkeypatch.setattr(
+        "tune_jobs.service.driver._import_all", lambda: done.append(f"all in {threading.current_thread().name}")
+    )
+    monkeypatch.setattr("tune_jobs.ray_tune.warm.warm_ray", ray)
     with contextlib.ExitStack() as stack:
         warm_up(stack, _settings(tmp_path, warm=True))
-        assert done == ["all"]
+        # Of what is imported already nothing is imported again.
+        assert done == (["starting", "all in MainThread", "started"] if starts else []) + ["all in MainThread"]
 
 
 def test_a_driver_that_is_not_kept_starts_no_process(tmp_path: Path) -> None:

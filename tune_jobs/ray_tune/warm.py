@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from tune_jobs.plan.machine import Machine
 from tune_jobs.ray_tune.cluster import connect
@@ -14,11 +14,12 @@ _MODULES = ("tune_jobs.ray_tune.pack_trainable", "tune_jobs.training.packed", "p
 
 
 @contextlib.contextmanager
-def warm_ray(machine: Machine) -> Iterator[None]:
+def warm_ray(machine: Machine, meanwhile: Callable[[], object] | None = None) -> Iterator[None]:
     """Start Ray for the block; a sweep that is run in it finds Ray and its processes there.
 
     Args:
         machine: The CPUs and GPUs to start Ray with.
+        meanwhile: What to do while Ray starts, in this thread.
 
     Raises:
         CannotRunError: Ray does not start.
@@ -26,7 +27,7 @@ def warm_ray(machine: Machine) -> Iterator[None]:
     before = os.environ.get(_PRELOAD)
     os.environ[_PRELOAD] = ",".join(_MODULES)
     try:
-        with connect(None, machine, is_users=True):
+        with connect(None, machine, is_users=True, meanwhile=meanwhile):
             yield
     finally:
         if before is None:

@@ -14,7 +14,6 @@ import os
 import signal
 import socket
 import sys
-import threading
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
@@ -104,19 +103,17 @@ def warm_up(stack: contextlib.ExitStack, settings: Mapping[str, Any]) -> None:
     from tune_jobs.plan.machine import local_machine
     from tune_jobs.ray_tune.warm import warm_ray
 
-    # Only now, so that two threads never import the same part of Ray at once.
-    importing = threading.Thread(target=_import_all, name="imports")
-    importing.start()
     try:
         # The plan is made anew on the machine that runs it, and takes its environment to a process of its own.
         stack.enter_context(guarding(start=True))
-        # Ray's processes take a second or two to start, in which this one would only wait.
-        stack.enter_context(warm_ray(local_machine()))
+        # Ray's processes take a second or two to start, in which this one would only wait. Not in a thread beside it:
+        # two that import parts of Ray at once may see modules half done.
+        stack.enter_context(warm_ray(local_machine(), _import_all))
     except CannotRunError as error:
         # The sweep says so, in its own words.
         _log.warning("What a sweep needs can't be started before there is one: %s", error)
-    finally:
-        importing.join()
+    # Where Ray did not get so far.
+    _import_all()
 
 
 def _import_all() -> None:
