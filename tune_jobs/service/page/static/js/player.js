@@ -181,17 +181,20 @@ export class Player {
 
   // Wait until the next step is to be seen: the service keeps the environment's time, but what was held up comes at once.
   async turn() {
-    while (this.isPaused) {
-      await new Promise((resolve) => {
-        this.resumed = resolve;
-      });
-      this.due = performance.now();
-    }
-    const pause = 1000 / (this.info.fps * this.speed);
-    // A little faster than it comes, so that nothing piles up.
-    this.due = Math.max(this.due + 0.95 * pause, performance.now() - MOST_BEHIND * pause);
-    const wait = this.due - performance.now();
-    if (wait > 4) await new Promise((resolve) => setTimeout(resolve, wait));
+    do {
+      while (this.isPaused) {
+        await new Promise((resolve) => {
+          this.resumed = resolve;
+        });
+        this.due = performance.now();
+      }
+      const pause = 1000 / (this.info.fps * this.speed);
+      // A little faster than it comes, so that nothing piles up.
+      this.due = Math.max(this.due + 0.95 * pause, performance.now() - MOST_BEHIND * pause);
+      const wait = this.due - performance.now();
+      if (wait > 4) await new Promise((resolve) => setTimeout(resolve, wait));
+      // It may have been held still while this waited.
+    } while (this.isPaused);
   }
 
   take(step) {
