@@ -7,7 +7,6 @@ nor on their order, so the same seed gives the same episode in a trial, on the c
 
 from __future__ import annotations
 
-import copy
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,10 +17,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.acting.policy import Action, Policy
+from policies.acting.classic_players import CartPolePlayer, RowsPlayer, Starts
+from policies.acting.policy import Action, NetworkPolicy, Policy
 from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
 from policies.envs.faults import close_env, env_failed
-from policies.envs.make import make_env, make_vector_env
+from policies.envs.make import make_env
 from policies.errors import EnvError, EnvFailedError, SpecError
 
 EndedBy = Literal["terminated", "truncated", "cap"]
@@ -30,7 +30,6 @@ EndedBy = Literal["terminated", "truncated", "cap"]
 MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
 _MAX_ENVS = 16
-_MAX_CARTPOLES = 256
 
 
 @dataclass(frozen=True)
@@ -104,12 +103,14 @@ class Evaluator:
         self.env_id, self.env_args = env_id, dict(env_args or {})
         self._envs = [make_env(env_id, self.env_args)]
         self.max_episode_steps = episode_cap(self._envs[0], max_episode_steps)
-        self._cartpoles = _CartPoles.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)
+        self._cartpoles = CartPolePlayer.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)
+        self._rows = None if self._cartpoles else RowsPlayer.make_if_classic(env_id, self.env_args, self.seeds)
 
     @property
-    def cartpole_starts(self) -> NDArray[np.float64] | None:
-        """CartPole's start state for each seed, shape (num_seeds, 4); None for another env or one with wrappers."""
-        return None if self._cartpoles is None else self._cartpoles.start_states
+    def starts(self) -> Starts | None:
+        """The start of each seed's episode in classic control; None for another env or one with wrappers."""
+        player = self._cartpoles or self._rows
+        return None if player is None else player.starts
 
     def check(self, policy: Policy) -> None:
         """Check that a policy can act in this environment.
@@ -133,6 +134,9 @@ class Evaluator:
             results = [self._play_alone(policy, seed) for seed in self.seeds]
         elif self._cartpoles is not None:
             results = self._cartpoles.play(policy, self.max_episode_steps)
+        elif self._rows is not None and type(policy) is NetworkPolicy:
+            # Another may give actions of other types or outside of their bounds, which is the environment's to judge.
+            results = self._rows.play(policy, self.max_episode_steps)
         else:
             results = self._play_side_by_side(policy)
         returns, lengths = zip(*results, strict=True)
@@ -142,6 +146,8 @@ class Evaluator:
         """Close the environments; `run` cannot be called afterwards."""
         for env in self._envs:
             close_env(env)
+        if self._rows is not None:
+            self._rows.close()
 
     def __enter__(self) -> Self:
         return self
@@ -330,67 +336,3 @@ class _Running:
             "steps",
             error,
         )
-
-
-class _CartPoles:
-    """Plays CartPole in Gymnasium's own vectorised version, which is ten times as fast as ten environments.
-
-    That version draws the start states of all sub-environments from one generator. So the states are drawn here as
-    the scalar env draws them, seed by seed, and put into the vectorised version. From equal states the two take the
-    same steps, to the last bit; tests compare the returns and lengths of both.
-    """
-
-    def __init__(self, env: Any, start_states: NDArray[np.float64]) -> None:
-        self._env = env
-        self.start_states = start_states  # shape (num_seeds, 4)
-
-    @classmethod
-    def make_if_cartpole(
-        cls, scalar_env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any], seeds: Sequence[int]
-    ) -> _CartPoles | None:
-        """Return a player for a CartPole without further wrappers, or None for any other env."""
-        from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
-
-        inner = scalar_env.unwrapped
-        if type(inner) is not CartPoleEnv or (scalar_env.spec and scalar_env.spec.additional_wrappers):
-            return None
-        if scalar_env.observation_space.shape != inner.observation_space.shape:  # pixels, or stacked frames
-            return None
-        vector_env = make_vector_env(env_id, env_args, min(len(seeds), _MAX_CARTPOLES))
-        if type(vector_env) is not CartPoleVectorEnv:
-            return None
-        start_states = []
-        for seed in seeds:
-            scalar_env.reset(seed=seed)
-            start_states.append(copy.copy(inner.state))
-        return cls(vector_env, np.array(start_states, dtype=np.float64))
-
-    def play(self, policy: Policy, max_episode_steps: int) -> list[tuple[float, int]]:
-        """Play one episode from each start state and return the return and the length of each."""
-        num_envs: int = self._env.num_envs
-        results: list[tuple[float, int]] = []
-        for first in range(0, len(self.start_states), num_envs):
-            chunk = self.start_states[first : first + num_envs]
-            results += self._play_chunk(policy, chunk, max_episode_steps)
-        return results
-
-    def _play_chunk(
-        self, policy: Policy, start_states: NDArray[np.float64], max_episode_steps: int
-    ) -> list[tuple[float, int]]:
-        env, num_episodes = self._env, len(start_states)
-        env.reset(seed=0)  # clears the step counters; the states it draws are replaced
-        env.state[:, :num_episodes] = start_states.T
-        observations = env.state.T.astype(np.float32)
-        returns, lengths = np.zeros(num_episodes), np.zeros(num_episodes, dtype=np.int64)
-        running = np.ones(num_episodes, dtype=bool)
-        actions = np.zeros(env.num_envs, dtype=np.int64)
-        for _ in range(max_episode_steps):
-            actions[:num_episodes] = policy.act_on_rows(observations[:num_episodes])
-            observations, rewards, terminated, truncated, _ = env.step(actions)
-            # Sub-environments whose episode has ended begin further ones by themselves, which do not count.
-            returns[running] += rewards[:num_episodes][running]
-            lengths[running] += 1
-            running &= ~(terminated | truncated)[:num_episodes]
-            if not running.any():
-                break
-        return [(float(total), int(length)) for total, length in zip(returns, lengths, strict=True)]

@@ -1,11 +1,12 @@
 """Play greedy episodes of many policies at once.
 
-Each policy gets the same episodes, to the last bit, as `Evaluator.run` gives it. In CartPole the episodes of all
-policies are stepped in one object, and networks of equal layers are computed together.
+Each policy gets the same episodes, to the last bit, as `Evaluator.run` gives it. In classic control the episodes of
+all policies are stepped in one object, and networks of equal layers are computed together.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import ActionSpace, NetworkPolicy, Policy, action_function
+from policies.envs.checked import is_sound
+from policies.envs.classic_rows import ClassicRows
 from policies.errors import TuneJobsError
 from policies.packed.envs.cartpole import CartPoleRows
 from policies.portable.forward import ForwardPass, ForwardPasses
@@ -51,14 +54,24 @@ def evaluate_many(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Resu
     at_once = max(1, _MAX_ROWS // len(evaluator.seeds))
     for first in range(0, len(joint), at_once):
         some = joint[first : first + at_once]
-        results |= zip(some, _play_cartpoles(evaluator, [policies[index] for index in some]), strict=True)
+        try:
+            results |= zip(some, _play_together(evaluator, [policies[index] for index in some]), strict=True)
+        except _UnsoundError:
+            results |= {index: _alone(evaluator, policies[index]) for index in some}
     return [results[index] for index in range(len(policies))]
+
+
+def _alone(evaluator: Evaluator, policy: Policy) -> Result:
+    try:
+        return evaluator.run(policy)
+    except TuneJobsError as error:
+        return error
 
 
 def _layout(evaluator: Evaluator, policy: Policy) -> tuple[Any, ...]:
     """Return what policies that are computed together have in common; empty for a policy that is computed alone."""
     # Exactly this class, because a subclass may act in another way.
-    if evaluator.cartpole_starts is None or type(policy) is not NetworkPolicy:
+    if evaluator.starts is None or type(policy) is not NetworkPolicy:
         return ()
     return ForwardPasses.layout(policy.portable.network)
 
@@ -85,15 +98,23 @@ class _Group:
             self._forward = self._forward.choose(places)
 
 
-def _play_cartpoles(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Episodes]:
+class _UnsoundError(Exception):
+    """An observation or a reward is not finite: which policy is to blame is found by playing each alone."""
+
+
+def _play_together(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Episodes]:
     """Play the episodes of policies that are sorted by their layouts, all of them in one object.
 
     Rows are the running episodes, those of the first policy first.
+
+    Raises:
+        _UnsoundError: See there.
     """
-    starts, num_seeds = evaluator.cartpole_starts, len(evaluator.seeds)
-    cartpoles = CartPoleRows.make(evaluator.env_id, evaluator.env_args)
+    starts, num_seeds = evaluator.starts, len(evaluator.seeds)
+    rows: CartPoleRows | ClassicRows | None = CartPoleRows.make(evaluator.env_id, evaluator.env_args)
+    rows = rows or ClassicRows.make(evaluator.env_id, evaluator.env_args)
     assert starts is not None
-    assert cartpoles is not None
+    assert rows is not None
     by_layout: dict[Any, dict[int, NetworkPolicy]] = {}
     for index, policy in enumerate(policies):
         assert isinstance(policy, NetworkPolicy)
@@ -102,30 +123,31 @@ def _play_cartpoles(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Ep
     returns, lengths = np.zeros(len(policies) * num_seeds), np.zeros(len(policies) * num_seeds, dtype=np.int64)
     episodes = np.arange(len(returns))  # the number of each row's episode: policy * num_seeds + seed
     counts = np.full(len(policies), num_seeds, dtype=np.intp)
-    states = np.tile(starts, (len(policies), 1))
-    cartpoles.put(states, np.zeros(len(states), dtype=np.int32))
-    observations = states.astype(np.float32)
-    for _ in range(evaluator.max_episode_steps):
-        actions, first = [], 0
-        for group in groups:
-            count = counts[group.indexes]
-            last = first + int(count.sum())
-            actions.append(group.act(observations[first:last], count))
-            first = last
-        observations, rewards, _, _, ended = cartpoles.step(np.concatenate(actions))
-        returns[episodes] += rewards
-        lengths[episodes] += 1
-        if ended.any():
-            rows = np.flatnonzero(~ended)
-            cartpoles.put(cartpoles.states[rows], cartpoles.lengths[rows])
-            observations, episodes = observations[rows], episodes[rows]
-            counts = np.bincount(episodes // num_seeds, minlength=len(policies))
+    observations = np.tile(starts.observations, (len(policies), 1))
+    rows.put(np.tile(starts.states, (len(policies), 1)), np.zeros(len(episodes), dtype=np.intp))
+    with contextlib.closing(rows):
+        for _ in range(evaluator.max_episode_steps):
+            actions, first = [], 0
             for group in groups:
-                group.keep(counts[group.indexes])
-            groups = [group for group in groups if group.indexes]
-            if not groups:
-                break
-    cartpoles.close()
+                count = counts[group.indexes]
+                last = first + int(count.sum())
+                actions.append(group.act(observations[first:last], count))
+                first = last
+            observations, rewards, terminated, truncated = rows.step(np.concatenate(actions))[:4]
+            if not (is_sound(rewards) and is_sound(observations)):
+                raise _UnsoundError
+            returns[episodes] += rewards
+            lengths[episodes] += 1
+            if (ended := terminated | truncated).any():
+                left = np.flatnonzero(~ended)
+                rows.put(rows.states[left], rows.lengths[left])
+                observations, episodes = observations[left], episodes[left]
+                counts = np.bincount(episodes // num_seeds, minlength=len(policies))
+                for group in groups:
+                    group.keep(counts[group.indexes])
+                groups = [group for group in groups if group.indexes]
+                if not groups:
+                    break
     return [
         Episodes(evaluator.seeds, tuple(totals), tuple(steps))
         for totals, steps in zip(

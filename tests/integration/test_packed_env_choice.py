@@ -15,15 +15,16 @@ __all__ = ["own_modules"]
 register_test_envs()
 
 
-def test_cartpole_is_vectorised() -> None:
-    step = measure_step("CartPole-v1", {"max_episode_steps": 200})
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "MountainCarContinuous-v0", "Pendulum-v1"])
+def test_classic_control_is_vectorised(env_id: str) -> None:
+    step = measure_step(env_id, {"max_episode_steps": 200})
     assert present(step.us) > 0
     assert choose_kind(step, spare_cpus=4).kind == "vectorised"
-    assert choose_kind(measure_step("CartPole-v1", {"frame_stack": 2}), spare_cpus=4).kind == "scalar"
+    assert choose_kind(measure_step(env_id, {"frame_stack": 2}), spare_cpus=4).kind == "scalar"
 
 
 def test_a_fast_env_stays_in_the_process() -> None:
-    step = measure_step("Pendulum-v1", None)
+    step = measure_step("policy_factory:Walk", None)
     assert present(step.us) > 0
     choice = choose_kind(StepTime(80.4), spare_cpus=4)
     assert (choice.kind, choice.why) == ("scalar", "a step takes 80 us")

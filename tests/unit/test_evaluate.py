@@ -10,11 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
 
-import policies.acting.evaluate
+import policies.acting.classic_players
 from policies.acting.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
 from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
 from policies.envs.make import make_env
 from policies.errors import EnvError, NonFiniteWeightsError, SpecError
+from policies.packed.evaluation import evaluate_many
 from tests.narrowing import present
 
 register_test_envs()
@@ -65,6 +66,35 @@ def test_vectorised_cartpole_has_the_scalar_env_s_other_reward(skill: str) -> No
     assert ours == expected
 
 
+@pytest.mark.parametrize("env_id", ["MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1", "Acrobot-v1"])
+def test_rows_of_classic_control_play_the_scalar_env_s_episodes(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policies.acting.classic_players, "_MAX_ROWS", 5)
+    some, seeds = [make_policy(env_id, seed=seed) for seed in (1, 2, 3)], tuple(range(1000, 1012))
+    expected = [by_hand(policy, env_id, seeds, 300) for policy in some]
+    assert len({total for episodes in expected for total in episodes.returns}) > 3 or env_id == "MountainCar-v0"
+    with Evaluator(env_id, None, seeds, max_episode_steps=300) as evaluator:
+        assert evaluator.starts is not None
+        assert [evaluator.run(policy) for policy in some] == expected
+        assert evaluate_many(evaluator, some) == expected
+
+
+def test_actions_that_are_no_numbers_are_the_policy_s_own_failure() -> None:
+    # Finite weights, of which outputs get infinite, and infinity less infinity is no number.
+    portable = make_portable("Pendulum-v1", seed=1)
+    layers = [
+        dataclasses.replace(layer, weight=layer.weight * np.float32(5e37), activation=activation)
+        for layer, activation in zip(portable.network.layers, ("relu", "relu", "linear"), strict=True)
+    ]
+    wild = dataclasses.replace(portable, network=dataclasses.replace(portable.network, layers=tuple(layers)))
+    broken, sane = NetworkPolicy(wild), make_policy("Pendulum-v1", seed=2)
+    with np.errstate(all="ignore"), Evaluator("Pendulum-v1", None, (1, 2, 3), max_episode_steps=20) as evaluator:
+        with pytest.raises(EnvError, match=r"(reward|observation) .* of Pendulum-v1 was NaN"):
+            evaluator.run(broken)
+        failed, played = evaluate_many(evaluator, [broken, sane])
+    assert isinstance(failed, EnvError)
+    assert played == by_hand(sane, "Pendulum-v1", (1, 2, 3), 20)
+
+
 @pytest.mark.parametrize("args", [{"pixels": True}, {"frame_stack": 3}, {"pixels": True, "frame_stack": 2}])
 def test_cartpole_in_wrappers_is_played_with_them(args: dict[str, bool | int]) -> None:
     class Parity(Policy):
@@ -102,7 +132,7 @@ def test_vectorised_cartpole_sees_the_scalar_env_s_observations_to_the_last_bit(
 
 @pytest.mark.parametrize("env_id", ["CartPole-v0", "Pendulum-v1", "TestWalk-v0"])
 def test_an_episode_depends_on_its_seed_alone(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policies.acting.evaluate, "_MAX_CARTPOLES", 8)
+    monkeypatch.setattr(policies.acting.classic_players, "_MAX_CARTPOLES", 8)
     policy = balancing_policy(env_id, "poor") if env_id == "CartPole-v0" else make_policy(env_id, seed=1)
     seeds = tuple(int(seed) for seed in np.random.default_rng(0).permutation(40)[:21])
     whole = evaluate_policy(policy, env_id=env_id, seeds=seeds, max_episode_steps=60)

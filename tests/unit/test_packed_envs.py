@@ -39,6 +39,9 @@ KINDS = [
     pytest.param("CartPole-v1", "scalar", id="cartpole-scalar"),
     pytest.param("Pendulum-v1", "scalar", id="pendulum-scalar"),
     pytest.param("Pendulum-v1", "processes", id="pendulum-processes"),
+    pytest.param("Pendulum-v1", "vectorised", id="pendulum-vectorised"),
+    pytest.param("MountainCarContinuous-v0", "vectorised", id="continuous-vectorised"),
+    pytest.param("Acrobot-v1", "vectorised", id="acrobot-vectorised"),
 ]
 
 
@@ -170,9 +173,15 @@ def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make: 
 
 @pytest.mark.parametrize(
     ("env_id", "env_args"),
-    [("Pendulum-v1", {}), ("CartPole-v1", {"pixels": True}), ("CartPole-v1", {"frame_stack": 2})],
+    [
+        ("policy_factory:Walk", {}),
+        ("CartPole-v1", {"pixels": True}),
+        ("CartPole-v1", {"frame_stack": 2}),
+        ("Pendulum-v1", {"frame_stack": 2}),
+        ("Acrobot-v1", {"pixels": True}),
+    ],
 )
-def test_only_a_plain_cartpole_is_vectorised(env_id: str, env_args: Any) -> None:
+def test_only_plain_classic_control_is_vectorised(env_id: str, env_args: Any) -> None:
     with pytest.raises(EnvError, match="no vectorised version"):
         make_packed_envs(env_id, env_args, 2, kind="vectorised")
 
@@ -329,17 +338,23 @@ def test_a_penalty_without_a_failure_is_refused() -> None:
 # -- scalar environments
 
 
-@pytest.mark.parametrize("kind", ["scalar", "processes"])
 @pytest.mark.parametrize(
-    ("env_id", "env_args"),
+    ("env_id", "env_args", "kind"),
     [
-        ("CartPole-v1", {"frame_stack": 2}),
-        ("Pendulum-v1", {"max_episode_steps": 9}),
-        ("policy_factory:Walk", {"end": 1.0}),
+        *((env_id, env_args, kind) for env_id, env_args in (
+            ("CartPole-v1", {"frame_stack": 2}),
+            ("Pendulum-v1", {"max_episode_steps": 9}),
+            ("policy_factory:Walk", {"end": 1.0}),
+        ) for kind in ("scalar", "processes")),
+        ("Pendulum-v1", {"max_episode_steps": 9}, "vectorised"),
+        ("Pendulum-v1", {"max_episode_steps": 9, "g": 3}, "vectorised"),
+        ("MountainCar-v0", {"max_episode_steps": 7, "goal_velocity": 0.01}, "vectorised"),
+        ("MountainCarContinuous-v0", {"max_episode_steps": 11}, "vectorised"),
+        ("Acrobot-v1", {"max_episode_steps": 8}, "vectorised"),
     ],
-)
+)  # fmt: skip
 def test_sub_environments_are_those_of_gym_make_with_seeds_one_after_the_other(
-    make: Any, kind: str, env_id: str, env_args: Any
+    make: Any, env_id: str, env_args: Any, kind: str
 ) -> None:
     envs = make(env_id, kind, env_args=env_args, members={"a": 2**32 - 2}, num_processes=2)
     scalars = [make_env(env_id, env_args) for _ in range(N)]

@@ -68,7 +68,7 @@ class CartPoleRows:
         """The number of steps of each running episode, shape (num,)."""
         return self._env.steps  # type: ignore[no-any-return]
 
-    def put(self, states: NDArray[np.float64], lengths: NDArray[np.int32]) -> None:
+    def put(self, states: NDArray[np.float64], lengths: NDArray[Any]) -> None:
         """Replace the cart-poles by others, in any number.
 
         Args:
@@ -135,8 +135,8 @@ class CartPoleEnvs:
         rows = CartPoleRows.make(env_id, env_args)
         if rows is None:
             raise EnvError(
-                f"{env_id} with arguments {dict(env_args or {})!r} has no vectorised version for packs; CartPole has, "
-                "without frame_stack and pixels.",
+                f"{env_id} with arguments {dict(env_args or {})!r} has no vectorised version for packs; CartPole, "
+                "MountainCar, Pendulum and Acrobot have, without frame_stack and pixels.",
                 "Use the kind 'scalar' or 'processes'.",
             )
         self.num_envs = num_envs

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from policies import random_streams
 from policies.envs.checked import reward_as_number
+from policies.envs.classic_rows import ClassicRows
 from policies.envs.make import make_env
 from policies.envs.masks import num_masked, sample
 from policies.errors import EnvError
@@ -72,18 +72,21 @@ def make_packed_envs(
         env_args: The same as for `policies.envs.make.make_env`.
         num_envs: Sub-environments of each member.
         failure_penalty: Reward of steps that end by failure, for training alone; None: the env's own reward.
-        kind: `vectorised`: only CartPole, all members in one object. `scalar`: any environment, one sub-environment
-            after the other. `processes`: the same, in child processes.
+        kind: `vectorised`: only classic control, all members in one object. `scalar`: any environment, one
+            sub-environment after the other. `processes`: the same, in child processes.
         num_processes: The number of child processes of the kind `processes`, at least 1.
 
     Raises:
         EnvError: The environment cannot be made, is not one of that kind, or there is a penalty and it has no failure.
     """
-    from policies.packed.envs.cartpole import CartPoleEnvs  # they take `Step` from here
+    from policies.packed.envs.cartpole import CartPoleEnvs
     from policies.packed.envs.scalar import ScalarEnvs
 
     if kind == "vectorised":
-        return CartPoleEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty)
+        rows = ClassicRows.make(env_id, env_args)
+        if rows is None:
+            return CartPoleEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty)
+        return ScalarEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty, rows=rows)
     num_processes = max(1, num_processes) if kind == "processes" else 0
     return ScalarEnvs(env_id, env_args, num_envs, failure_penalty=failure_penalty, num_processes=num_processes)
 
@@ -96,7 +99,8 @@ def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
     """
     from policies.packed.envs.cartpole import CartPoleRows
 
-    if (rows := CartPoleRows.make(env_id, env_args)) is not None:
+    rows = CartPoleRows.make(env_id, env_args) or ClassicRows.make(env_id, env_args)
+    if rows is not None:
         rows.close()
         return StepTime(_vectorised_step_us(env_id, env_args), is_vectorised=True)
     return StepTime(_scalar_step_us(env_id, env_args))
@@ -155,7 +159,9 @@ def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> floa
     num_envs, num_steps = 64, 50
     envs = make_packed_envs(env_id, env_args, num_envs, kind="vectorised")
     envs.add("", 0)
-    actions = random_streams.fixed().integers(0, 2, (num_steps, num_envs))
+    space = copy.deepcopy(envs.action_space)
+    space.seed(0)
+    actions = np.array([[space.sample() for _ in range(num_envs)] for _ in range(num_steps)])
     envs.step(actions[0])
     begin = time.perf_counter()
     envs.begin(num_steps)

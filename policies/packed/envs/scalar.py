@@ -1,4 +1,7 @@
-"""Step any environment for all members of a pack: scalar sub-environments, in this process or in others."""
+"""Step any environment for all members of a pack: scalar sub-environments, in this process or in others.
+
+Those of classic control, which can be rows of arrays, are stepped in one object; all else is the same.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.classic_rows import ClassicRows
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.spaces import observation_dtype
 from policies.envs.tallies import Tally, tally_of
 from policies.errors import EnvError
+from policies.packed.envs.classic_host import ClassicHost
 from policies.packed.envs.penalty import Penalty
 from policies.packed.envs.process import ProcessHost
 from policies.packed.envs.rows import MemberRows, Rows
@@ -51,6 +56,7 @@ class ScalarEnvs:
         num_envs: Sub-environments of each member.
         failure_penalty: Reward of steps that end by failure; None: the env's own reward.
         num_processes: Processes to step them in; 0: in this one.
+        rows: Steps all of them at once, in this process; None: one is stepped after the other.
 
     Raises:
         EnvError: The environment cannot be made, or there is a penalty and it has no failure.
@@ -64,6 +70,7 @@ class ScalarEnvs:
         *,
         failure_penalty: float | None = None,
         num_processes: int = 0,
+        rows: ClassicRows | None = None,
     ) -> None:
         self._env_id, self._env_args = env_id, dict(env_args or {})
         env = make_env(env_id, self._env_args)
@@ -75,7 +82,7 @@ class ScalarEnvs:
         self._penalty = Penalty.find(env_id, self._env_args, failure_penalty)
         self._members = MemberRows(num_envs)
         self._num_processes = num_processes
-        self._parts: list[_Part] = []
+        self._parts: list[_Part] = [] if rows is None else [_Part(ClassicHost(rows, env_id))]
         self._suspects: set[str] = set()
         self._tallies: dict[str, Tally] = {}
         self.observations: NDArray[Any] = self._zeros(0)
