@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 Indices = NDArray[np.int64]
 Sums = NDArray[np.float64]
 
+_FEW = 10
+"""So many neighbouring nodes take as long as one by its index."""
+
 
 class SumTrees:
     """Trees of sums, whose leaves are all 0 at first.
@@ -62,9 +65,14 @@ class SumTrees:
         nodes = leaves
         # Every level is updated, whichever the rows are, and if there are none.
         for level in range(len(levels) - 1, 0, -1):
-            below, nodes = levels[level], nodes >> 1
-            left = 2 * nodes
-            levels[level - 1][nodes] = below[left] + below[left + 1]
+            below, above, nodes = levels[level], levels[level - 1], nodes >> 1
+            if len(above) <= _FEW * nodes.size:
+                # All of it at once takes less time than these nodes one by one, and gives the others what they have.
+                np.add(below[::2], below[1::2], out=above)
+                continue
+            # Two neighbours are one complex number: fetched at once.
+            pairs = below.view(np.complex128).take(nodes)
+            above[nodes] = pairs.real + pairs.imag
 
     def find(self, trees: Indices, heights: Sums) -> Indices:
         """Return the leaves that lie at these heights if a tree's leaves are stacked.
@@ -75,11 +83,13 @@ class SumTrees:
             trees: The tree of each height.
             heights: From 0 to the tree's total.
         """
-        nodes = trees
+        nodes, heights = np.array(trees), np.array(heights)
         for sums in self._levels[1:]:
-            left = 2 * nodes
-            lower = sums[left]
+            nodes *= 2
+            lower = sums.take(nodes)
             beyond = heights >= lower
-            heights = np.where(beyond, heights - lower, heights)
-            nodes = left + beyond
+            nodes += beyond
+            # Less 0 where they do not lie beyond.
+            lower *= beyond
+            heights -= lower
         return nodes

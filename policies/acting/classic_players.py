@@ -107,7 +107,7 @@ class RowsPlayer:
     def make_if_classic(cls, env_id: str, env_args: Mapping[str, Any], seeds: Sequence[int]) -> RowsPlayer | None:
         """Return a player, or None for any other env, or one in further wrappers."""
         rows = ClassicRows.make(env_id, env_args)
-        return None if rows is None else cls(calls.watch_env(rows), env_id, seeds)
+        return None if rows is None else cls(calls.watch_rows(rows), env_id, seeds)
 
     def play(self, policy: Policy, max_episode_steps: int) -> list[tuple[float, int]]:
         """Play one episode from each start and return the return and the length of each.

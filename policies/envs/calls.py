@@ -146,6 +146,11 @@ def watch_env(env: _Watched) -> _Watched:
     return _watch(env, _ENV_METHODS)
 
 
+def watch_rows(rows: _Watched) -> _Watched:
+    """Have rows of an environment write their starts and steps to the page, if this process is watched."""
+    return _watch(rows, {"start": Call.RESET, "step": Call.STEP})
+
+
 def watch_policy(policy: _Watched) -> _Watched:
     """Have a policy write its calls to the page, if this process is watched."""
     return _watch(policy, {"act": Call.ACT, "act_on_row": Call.ACT})

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -13,6 +14,7 @@ from policy_factory import balancing_policy, make_policy, make_portable, registe
 import policies.acting.classic_players
 from policies.acting.evaluate import Episodes, Evaluator, episode_steps, evaluate_policy, play_episode
 from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
+from policies.envs import calls
 from policies.envs.make import make_env
 from policies.errors import EnvError, NonFiniteWeightsError, SpecError
 from policies.packed.evaluation import evaluate_many
@@ -76,6 +78,19 @@ def test_rows_of_classic_control_play_the_scalar_env_s_episodes(env_id: str, mon
         assert evaluator.starts is not None
         assert [evaluator.run(policy) for policy in some] == expected
         assert evaluate_many(evaluator, some) == expected
+
+
+def test_a_watched_process_says_that_it_steps_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    number = os.memfd_create("page")
+    os.truncate(number, calls.PAGE_BYTES)
+    page = calls.Page(number)
+    monkeypatch.setattr(calls, "_page", page)
+    with Evaluator("Acrobot-v1", None, (1, 2), max_episode_steps=20) as evaluator:
+        before = page.count
+        evaluator.run(make_policy("Acrobot-v1", seed=2))
+    os.close(number)
+    assert page.count >= before + 40
+    assert page.steps == 20
 
 
 def test_actions_that_are_no_numbers_are_the_policy_s_own_failure() -> None:
