@@ -76,6 +76,14 @@ WORKS = {
             "minibatch_size": 128, "num_epochs": 10, "gae_lambda": 0.95, "normalize_observations": True,
         },
     ),
+    "acrobot": Work(
+        "PPO on Acrobot, 8 trials", "ppo", "Acrobot-v1", 8, 50_000, "4 x",
+        # RL Zoo's kind of setting.
+        changes={
+            "hidden_sizes": [64, 64], "activation": "tanh", "lr": 3e-4, "num_envs": 16, "train_batch_size": 4096,
+            "minibatch_size": 64, "num_epochs": 4, "gae_lambda": 0.94, "normalize_observations": True,
+        },
+    ),
     "cartpole-dqn": Work(
         "DQN on CartPole, tuned, 10 trials", "dqn", "CartPole-v1", 10, 20_000, "5 x", "cartpole-dqn-tuned"
     ),
