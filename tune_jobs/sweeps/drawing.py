@@ -30,6 +30,9 @@ _DRAWN_WITH = (
 )  # fmt: skip
 Videos = Mapping[str, Path]
 
+_importing: list[threading.Thread] = []
+"""What `import_ahead` has begun."""
+
 
 @dataclass(frozen=True)
 class ReportMatter:
@@ -76,6 +79,9 @@ class ReportMatter:
         Raises:
             CannotRunError: A file cannot be written.
         """
+        # Two threads that import parts of one package at once may see modules half done.
+        for thread in _importing:
+            thread.join()
         from analysis.report import build_report
 
         why = self.why_no_best
@@ -172,7 +178,10 @@ class DrawnReport:
 
 
 def import_ahead() -> None:
-    """Import in the background what figures are drawn with, while this process waits for others."""
+    """Import in the background what figures are drawn with, while this process waits for others.
+
+    A report waits for it, and nothing else here imports these packages.
+    """
 
     def load() -> None:
         # What can't be imported is an error where it is needed.
@@ -180,4 +189,5 @@ def import_ahead() -> None:
             for name in _DRAWN_WITH:
                 importlib.import_module(name)
 
-    threading.Thread(target=load, name="tune-jobs-imports", daemon=True).start()
+    _importing.append(threading.Thread(target=load, name="tune-jobs-imports", daemon=True))
+    _importing[-1].start()
