@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import statistics
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,6 +16,7 @@ from tests.benchmarks.search import whole_runs as module
 from tests.benchmarks.search.pack_trainer import PackTrainer
 from tests.benchmarks.search.runs import mean_or_worst
 from tests.benchmarks.search.schedulers import (
+    MF_PBT,
     NUM_AT_ONCE,
     SCHEDULERS,
     Stage,
@@ -103,7 +105,9 @@ def made(method: str, number: int) -> tuple[Tuned, Formula]:
 played = functools.cache(made)
 
 
-@pytest.mark.parametrize(("method", "number"), [("asha", 0), ("asha", 1), ("asha", 2), ("pbt", 0), ("pb2", 0)])
+@pytest.mark.parametrize(
+    ("method", "number"), [("asha", 0), ("asha", 1), ("asha", 2), ("pbt", 0), ("mf-pbt", 0), ("pb2", 0)]
+)
 def test_a_run_trains_as_many_env_steps_as_those_of_the_other_methods(method: str, number: int) -> None:
     found, trainer = played(method, number)
     num_points = task_for(method).spec.num_samples
@@ -169,11 +173,11 @@ def test_asha_ends_what_is_ruined_and_a_failed_point_is_never_the_best() -> None
     assert set(told.values()) == {3 * 2_048}
 
 
-@pytest.mark.parametrize("method", ["pbt", "pb2"])
+@pytest.mark.parametrize("method", ["pbt", "mf-pbt", "pb2"])
 def test_a_population_is_compared_as_the_products_is(method: str) -> None:
     found, _ = played(method, 0)
     spec = task_for(method).spec
-    assert spec.scheduler == SchedulerSpec.model_validate({"type": method})
+    assert spec.scheduler == SchedulerSpec.model_validate(MF_PBT if method == "mf-pbt" else {"type": method})
     drawn = random_points(TASK, 0)
     records = {
         f"t{index:04d}": TrialRecord(
@@ -221,7 +225,7 @@ class _Nobody:
         return ()
 
 
-@pytest.mark.parametrize("method", ["pbt", "pb2"])
+@pytest.mark.parametrize("method", ["pbt", "mf-pbt", "pb2"])
 def test_a_members_schedule_is_what_its_weights_were_trained_with(method: str) -> None:
     found, _ = played(method, 0)
     assert max(map(len, found.schedules)) > 3
@@ -234,9 +238,8 @@ def test_a_members_schedule_is_what_its_weights_were_trained_with(method: str) -
     assert trainer.seeds == set(TEST_SEEDS)
     assert trainer.trained == len(TEST_SEEDS) * WHOLE
     # Those that gain nothing are copied over.
-    assert max(found.scores) > max(
-        mean_or_worst(replayed(TASK, schedule[:1], TUNING_SEEDS, Formula())) for schedule in found.schedules
-    )
+    alone = [mean_or_worst(replayed(TASK, schedule[:1], TUNING_SEEDS, Formula())) for schedule in found.schedules]
+    assert statistics.median(found.scores) > statistics.median(alone) + 5
 
 
 def test_a_population_whose_members_are_apart_is_refused() -> None:
