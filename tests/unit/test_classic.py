@@ -158,3 +158,16 @@ def test_where_gymnasium_steps_in_another_way_there_are_no_rows(monkeypatch: pyt
     assert ClassicRows.make("MountainCar-v0", None) is not None
     monkeypatch.setattr(MountainCarEnv, "step", another)
     assert ClassicRows.make("MountainCar-v0", None) is None
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_args"),
+    [
+        ("Pendulum-v1", {"g": float("nan")}),
+        ("Pendulum-v1", {"g": "strong"}),
+        ("MountainCar-v0", {"goal_velocity": "fast"}),
+    ],
+)
+def test_arguments_that_are_no_numbers_are_left_to_the_env_itself(env_id: str, env_args: dict[str, Any]) -> None:
+    with np.errstate(all="ignore"):
+        assert ClassicRows.make(env_id, env_args) is None
