@@ -35,7 +35,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(run: RunCommand, tmp_path:
         "packed; environments: vectorised, ",
         " us per step",
         "1 in 1 pack of up to 1, each pack on 1 CPU",
-        "at most 2,020,620",
+        "at most 2,020,620, and 1,010,310 of more seeds",
         "MB",
         "t0019",
         "64",
@@ -52,6 +52,19 @@ def test_one_of_a_thing_is_not_called_many(run: RunCommand) -> None:
     lines = run("launch", "one.yaml", "--dry-run", *one).stdout.splitlines()
     assert any(line.split()[1:] == ["1:", "1", "point,", "1", "seed", "each"] for line in lines)
     assert any("1 episode or 1 env step or 1 iteration or" in line for line in lines)
+
+
+def test_the_env_steps_and_the_disk_of_a_plan_are_those_of_more_seeds_too(run: RunCommand) -> None:
+    with_more = run("launch", "cartpole-ppo", "--dry-run").stdout.splitlines()
+    without = run("launch", "cartpole-ppo", "--dry-run", "--set", "confirm=none").stdout.splitlines()
+
+    def told(lines: list[str], name: str) -> str:
+        return next(line.removeprefix(name).strip() for line in lines if line.startswith(name))
+
+    assert told(without, "env steps") == "at most 2,020,620 in all"
+    disk, less = (float(told(lines, "disk").split()[-2]) for lines in (with_more, without))
+    assert told(with_more, "disk").split()[-1] == told(without, "disk").split()[-1]
+    assert disk == pytest.approx(1.5 * less, rel=0.01)
 
 
 def test_a_dry_run_of_many_trials_shows_the_first_ones(run: RunCommand) -> None:

@@ -40,7 +40,7 @@ def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
 def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
     from tune_jobs.sweeps.confirm import largest_race
 
-    machine, stop = plan.machine, spec.stop
+    machine, stop, race = plan.machine, spec.stop, largest_race(spec, plan.num_points)
     returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
     rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
     rules += [] if stop.num_episodes is None else [counted(stop.num_episodes, "episode")]
@@ -61,9 +61,9 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "a trial stops at": " or ".join(rules),
         "search": _search_fact(spec),
         "scheduler": _scheduler_fact(spec),
-        "then": _confirm_fact(largest_race(spec, plan.num_points)),
-        "env steps": f"at most {plan.max_env_steps:,} in all",
-        "disk": f"at most about {bytes_text(plan.max_disk_bytes)}",
+        "then": _confirm_fact(race),
+        "env steps": _env_steps_fact(plan, race),
+        "disk": f"at most about {bytes_text(_disk_bytes(plan, race))}",
         "seeds": f"sweep {spec.seed}; evaluation {span(plan.evaluation_seeds)}; "
         f"confirmation {span(plan.confirmation_seeds)}",
     }
@@ -131,6 +131,19 @@ def _confirm_fact(race: Race | None) -> str:
         return "no setting is trained again"
     trials = counted(race.max_trainings, "trial")
     return f"the {len(race.contenders)} leading settings get more seeds: at most {trials} (confirm: none leaves it out)"
+
+
+def _env_steps_fact(plan: SweepPlan, race: Race | None) -> str:
+    told = f"at most {plan.max_env_steps:,}"
+    if race is None:
+        return f"{told} in all"
+    return f"{told}, and {race.max_trainings * plan.max_env_steps_per_trial:,} of more seeds"
+
+
+def _disk_bytes(plan: SweepPlan, race: Race | None) -> int:
+    """Return the most that the sweep's folder will hold, with the trials of more seeds like the others."""
+    more = 0 if race is None else race.max_trainings
+    return plan.max_disk_bytes * (len(plan.trials) + more) // max(1, len(plan.trials))
 
 
 def _plan_table(spec: SweepSpec, plan: SweepPlan) -> Table:

@@ -70,7 +70,7 @@ class SweepPlan:
     evaluation_seeds: tuple[int, ...]
     confirmation_seeds: tuple[int, ...]
     max_env_steps: int
-    """Upper bound of the env steps of all trials without retries and evaluation episodes."""
+    """Upper bound of the env steps of all these trials without retries and evaluation episodes."""
     max_disk_bytes: int
     """Estimate of the most bytes that the sweep folder will hold."""
     env: EnvInfo
@@ -79,6 +79,8 @@ class SweepPlan:
     """Notes on settings that may not be meant, and on trials that are not packed."""
     prior: tuple[PriorRecord, ...] = ()
     """What the search of a new sweep begins with, of earlier sweeps."""
+    max_env_steps_per_trial: int = 0
+    """The same of the trial for which it is highest; those that `confirm` adds are no longer."""
     packs: PackPlan | None = None
     """The packs of the packed trials that have not ended; None: there are none."""
 
@@ -112,7 +114,10 @@ class SweepPlan:
         Raises:
             CannotRunError: It is no such data, or another version's.
         """
-        simple = ("num_points", "cpus_per_trial", "gpus_per_trial", "max_concurrent", "max_env_steps", "max_disk_bytes")
+        simple = (
+            "num_points", "cpus_per_trial", "gpus_per_trial", "max_concurrent", "max_env_steps", "max_disk_bytes",
+            "max_env_steps_per_trial",
+        )  # fmt: skip
         unknown: gym.Space[Any] = gym.Space()
         try:
             env, packs = data["env"], data["packs"]
@@ -195,6 +200,7 @@ def make_plan(
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
         concurrent = packs.max_concurrent if all_are_packed else max(packs.max_concurrent, concurrent)
+    lengths = _largest(sizes, specs, max_env_steps)
     return SweepPlan(
         trials=trials,
         num_points=len(points),
@@ -203,7 +209,8 @@ def make_plan(
         max_concurrent=concurrent,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
-        max_env_steps=_total(trials, _largest(sizes, specs, max_env_steps)),
+        max_env_steps=_total(trials, lengths),
+        max_env_steps_per_trial=max(lengths, default=0),
         max_disk_bytes=_SWEEP_BYTES
         + _total(trials, _largest(sizes, specs, lambda own, each: max_disk_bytes(own, env, each))),
         env=env,
