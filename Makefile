@@ -52,21 +52,22 @@ $(VENV)/installed-bench: $(VENV)/installed
 	@touch $@
 
 # In four processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
-# each with a Ray of its own, the unit tests, and the others; with the types beside them. What the parts print, skipped tests with their
-# reasons too, comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else
-# the environment says.
+# each with a Ray of its own, the unit tests, and the others, followed by the third part of tests/ray; with the types
+# beside them. All four take about as long. What the parts print, skipped tests with their reasons too, comes at the end.
+# Processes by the hundred import the same modules: these are compiled once, whatever else the environment says.
 RAY := tests/ray
 # It needs no Ray of the tests' own: it stands where there is time left.
 SERVED := $(RAY)/test_service.py
+LAST := $(filter-out $(SERVED),$(sort $(wildcard $(RAY)/test_s*.py)))
 OTHERS := $(filter-out $(RAY)/ tests/unit/,$(sort $(dir $(wildcard tests/*/test_*.py))))
 PYTEST := $(BIN)/python -m pytest --durations=15 --durations-min=5
 test unit: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
-	$(PYTEST) $(RAY)/test_[a-ot-z]*.py $(SERVED) > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
-	$(PYTEST) $(filter-out $(SERVED),$(sort $(wildcard $(RAY)/test_[p-s]*.py))) > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
+	$(PYTEST) $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
+	$(PYTEST) $(RAY)/test_[p-r]*.py $(SERVED) > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
 	$(PYTEST) tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
-	$(PYTEST) $(OTHERS); others=$$?; \
+	$(PYTEST) $(OTHERS) $(LAST); others=$$?; \
 	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \
