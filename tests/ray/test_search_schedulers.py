@@ -316,6 +316,10 @@ def test_tables_have_a_column_for_each_method_that_has_runs_and_ranks_of_those_t
     assert "asha" not in text
     assert "Mean rank of 2 over 2 tasks, while tuning: random 1.50, gp 1.50" in text
     assert "Mean rank of 3 over 1 task, while tuning: random 2.50, gp 2.50, pbt 1.00" in text
+    # A method that has run one task takes no rank from those that have run both.
+    text = "\n".join(tables({**found, (first, "tpe"): kept(0, 0)}))
+    assert "Mean rank of 2 over 2 tasks, while tuning: random 1.50, gp 1.50" in text
+    assert "Mean rank of 3 over 1 task, while tuning: random 1.50, gp 1.50, tpe 3.00" in text
     assert values_of(kept(1, 2), "score") == [1, 2]
 
 

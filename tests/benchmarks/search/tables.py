@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,10 @@ def tables(kept: Kept) -> Iterator[str]:
     yield ""
     yield from _table(kept, tasks, methods, "test", published=False)
     yield ""
-    # Who looks at trainings before their end may not have run all tasks that the others have.
+    # The more methods, the fewer tasks that all of them have run.
+    everywhere = [method for method in methods if all(kept.get((task, method)) for task in tasks)]
     choosing = [method for method in methods if method in METHODS]
-    for some in [choosing, *([methods] if methods != choosing else [])]:
+    for some in dict.fromkeys(map(tuple, (everywhere, choosing, methods))):
         yield from _ranks(kept, tasks, some)
     yield ""
     yield from _made(kept, tasks, methods)
@@ -65,7 +66,7 @@ def _cell(found: dict[str, Any], what: str) -> str:
     return f"{values.mean():.1f} ± {half:.1f}{of}"
 
 
-def _ranks(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
+def _ranks(kept: Kept, tasks: list[str], methods: Sequence[str]) -> Iterator[str]:
     """Yield mean ranks over the tasks that all methods have run, each run compared with those of its number."""
     whole = [task for task in tasks if all(kept.get((task, method)) for method in methods)]
     if not whole or len(methods) < 2:
