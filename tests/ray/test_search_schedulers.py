@@ -94,8 +94,8 @@ SMALL = TASK.with_spec(TASK.spec.model_copy(update={"num_samples": 8}))
 
 
 def task_for(method: str, number: int = 0) -> Task:
-    """The model of pb2 takes seconds for as many members as the benchmark has."""
-    return task_of(SMALL if method == "pb2" else TASK, method, number)
+    """Models take seconds for as many points as the benchmark has."""
+    return task_of(SMALL if method in {"pb2", "gp-asha"} else TASK, method, number)
 
 
 def made(method: str, number: int) -> tuple[Tuned, Formula]:
@@ -107,12 +107,12 @@ played = functools.cache(made)
 
 
 @pytest.mark.parametrize(
-    ("method", "number"), [("asha", 0), ("asha", 1), ("asha", 2), ("pbt", 0), ("mf-pbt", 0), ("pb2", 0)]
+    ("method", "number"), [("asha", 0), ("asha", 1), ("asha", 2), ("gp-asha", 0), ("pbt", 0), ("mf-pbt", 0), ("pb2", 0)]
 )
 def test_a_run_trains_as_many_env_steps_as_those_of_the_other_methods(method: str, number: int) -> None:
     found, trainer = played(method, number)
     num_points = task_for(method).spec.num_samples
-    assert num_points == (8 if method == "pb2" else 32)
+    assert num_points == (8 if method in {"pb2", "gp-asha"} else 32)
     assert trainer.trained == sum(found.num_env_steps) == num_points * len(TUNING_SEEDS) * WHOLE
     assert trainer.seeds == set(TUNING_SEEDS)
     assert max(found.scores) > -math.inf
@@ -130,6 +130,12 @@ def test_a_run_is_the_same_again_and_begins_with_the_points_of_the_random_search
     if method == "asha":
         assert first == [next(drawn) for _ in first]
         assert len(first) > 60
+    elif method == "gp-asha":
+        points = [next(drawn) for _ in first]
+        num_random = TASK.spec.search.num_startup_trials
+        assert len(first) > num_random + 5
+        assert first[:num_random] == points[:num_random]
+        assert all(point not in points for point in first[-5:])
     else:
         points = [next(drawn) for _ in first]
         assert all(point in points for point in first)

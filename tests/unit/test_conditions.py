@@ -117,7 +117,10 @@ def test_combinations_that_nobody_could_train_are_not_listed() -> None:
     many = {f"g{index}": {"grid": list(range(100))} for index in range(8)}
     bound = {f"c{index}": {"grid": list(range(100)), "when": {f"g{index}": 0}} for index in range(8)}
     assert num_points(space_of(**many), 1) == 100**8
-    assert num_points(space_of(**many, **bound), 1) >= 100_000
+    assert num_points(space_of(**many, **bound), 3) == 3 * 199**8
+    # All of them in one group: as many as are counted.
+    chained = {f"c{index}": {"grid": [1, 2], "when": {"g0": 0, f"g{index + 1}": 0}} for index in range(7)}
+    assert num_points(space_of(**many, **chained), 1) >= 100_000
 
 
 # -- what is refused

@@ -17,12 +17,8 @@ _MOST_COMBINATIONS = 1_000_000
 
 def num_points(space: Mapping[str, Domain], num_samples: int) -> int:
     """Return how many points `draw_points` returns; beyond a million it may return less."""
-    grids = _grids(space)
-    related = {name for name, grid in grids.items() if grid.when} | {
-        other for grid in grids.values() for other in grid.when or {}
-    }
-    alone = math.prod(len(grid.values) for name, grid in grids.items() if name not in related)
-    return num_samples * alone * len(_acting_combinations(space, [name for name in grids if name in related]))
+    # Grids that no condition connects multiply, so that only those of one group are listed together.
+    return num_samples * math.prod(len(_acting_indexes(space, group)) for group in _connected(_grids(space)))
 
 
 def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) -> list[dict[str, Any]]:
@@ -92,8 +88,26 @@ def _grids(space: Mapping[str, Domain]) -> dict[str, Grid]:
     return {name: domain for name, domain in space.items() if isinstance(domain, Grid)}
 
 
+def _connected(grids: Mapping[str, Grid]) -> list[list[str]]:
+    """Divide grids into groups between which there is no condition, each in the order of the space."""
+    groups: list[set[str]] = []
+    for name, grid in grids.items():
+        touched = {name, *(other for other in grid.when or {} if other in grids)}
+        groups = [group for group in groups if not group & touched] + [
+            touched.union(*(group for group in groups if group & touched))
+        ]
+    return [[name for name in grids if name in group] for group in groups]
+
+
 def _acting_combinations(space: Mapping[str, Domain], names: list[str]) -> list[dict[str, Any]]:
     """Return each combination of some grids' values once, without values that do not act, in the order of the grid."""
+    grids, found = _grids(space), _acting_indexes(space, names)
+    found.sort(key=lambda indexes: [indexes.get(name, -1) for name in names])
+    return [{name: grids[name].values[indexes[name]] for name in names if name in indexes} for indexes in found]
+
+
+def _acting_indexes(space: Mapping[str, Domain], names: list[str]) -> list[dict[str, int]]:
+    """Return the same in any order, as the places of values in their grids; of too many, some of their beginnings."""
     grids, conditions = _grids(space), Conditions(space)
     found: list[dict[str, int]] = [{}]
     for name in in_order(space):
@@ -104,7 +118,6 @@ def _acting_combinations(space: Mapping[str, Domain], names: list[str]) -> list[
                 acts = name in conditions.acting(known)
                 grown += [indexes | {name: index} for index in range(len(grids[name].values))] if acts else [indexes]
                 if len(grown) >= _MOST_COMBINATIONS:
-                    break
+                    return grown
             found = grown
-    found.sort(key=lambda indexes: [indexes.get(name, -1) for name in names])
-    return [{name: grids[name].values[indexes[name]] for name in names if name in indexes} for indexes in found]
+    return found

@@ -1,4 +1,6 @@
-"""Runs of methods that look at trainings before their end: `asha`, `pbt`, `mf-pbt`, `pb2`, by the product's own rules.
+"""Runs of methods that look at trainings before their end, by the product's own rules.
+
+`asha` with random points and with those of a model, and populations: `pbt`, `mf-pbt` and `pb2`.
 
 All that trains does so side by side and equally fast, so that the order in which the rules are asked depends on returns
 alone. A point's seeds train in step, and the rules are told the mean over them, as ARLBench tells its optimisers.
@@ -6,6 +8,7 @@ alone. A point's seeds train in step, and the rules are told the mean over them,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -16,6 +19,7 @@ from tests.benchmarks.search.runs import mean_or_worst
 from tests.benchmarks.search.tasks import TEST_SEEDS, TUNING_SEEDS, Task
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.search.gains import Score
+from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.proposal import next_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.scheduler import SchedulerSpec
@@ -24,7 +28,9 @@ from tune_jobs.store.transitions import with_change
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.scheduling import Standing
 
-SCHEDULERS = ("asha", "pbt", "mf-pbt", "pb2")
+SEARCH_OF_ASHA = {"asha": "random", "gp-asha": "gp"}
+"""The `search.type` that goes with it, by method."""
+SCHEDULERS = (*SEARCH_OF_ASHA, "pbt", "mf-pbt", "pb2")
 """The methods whose runs are here."""
 MF_PBT = {"type": "pbt", "frequencies": [1, 3]}
 """Two sub-populations. The slower one is compared three times in ten intervals; with the paper's 5 it would be once."""
@@ -68,7 +74,7 @@ def task_of(task: Task, method: str, number: int) -> Task:
     which theirs fixes too; the first update comes after 128 env steps, their default; the replay memory holds a
     training, as theirs does.
     """
-    if method == "asha":
+    if method in SEARCH_OF_ASHA:
         return task
     data = task.spec.model_dump(mode="json", exclude_defaults=True)
     dqn = {"target_network": True, "learning_starts": 128, "replay_capacity": task.spec.stop.num_env_steps}
@@ -95,7 +101,9 @@ def tuned(task: Task, method: str, number: int, trainer: Trainer) -> Tuned:
         number: The run's number, which is the seed of its draws.
         trainer: Trains the task.
     """
-    return asha(task, number, trainer) if method == "asha" else population(task, trainer)
+    if method in SEARCH_OF_ASHA:
+        return asha(task, number, trainer, SEARCH_OF_ASHA[method])
+    return population(task, trainer)
 
 
 def random_points(task: Task, number: int) -> Iterator[dict[str, Any]]:
@@ -128,13 +136,13 @@ def tested(task: Task, schedule: Sequence[Stage], trainer: Trainer) -> float:
 
 
 class _Asha:
-    """A run of successive halving (Li et al. 2020): points are drawn at random until the env steps are spent.
+    """A run of successive halving (Li et al. 2020): points are tried until the env steps are spent.
 
     The budget is that of 32 whole points, to the env step. A place that gets free is taken by a new point at once, as
     long as what is left brings it and all that train to their ends; the last one trains with what remains.
     """
 
-    def __init__(self, task: Task, number: int, trainer: Trainer) -> None:
+    def __init__(self, task: Task, number: int, trainer: Trainer, search: str) -> None:
         from tune_jobs.ray_tune.early_stopping import build_scheduler, grace_env_steps
 
         scheduler = SchedulerSpec(type="asha")
@@ -142,13 +150,15 @@ class _Asha:
         self._cap = task.spec.stop.num_env_steps
         self._rule = build_scheduler(scheduler, self._cap)
         self._first_rung, self._factor = grace_env_steps(scheduler, self._cap), scheduler.reduction_factor
-        self._drawn = random_points(task, number)
+        self._search, self._number = search, number
         self._points: list[dict[str, Any]] = []
         self._steps: dict[str, int] = {}
         """Env steps that a seed of each point has trained, in the order in which they began."""
         self._rungs: dict[str, float] = {}
         """The next rung of each point that trains."""
         self._scores: dict[str, float] = {}
+        self._ended: dict[str, KnownPoint] = {}
+        """What a model is told of each point that does not train any more."""
         self._told: list[tuple[str, int, float, str]] = []
         self._per_iteration = 0
         self._left = 0
@@ -176,10 +186,21 @@ class _Asha:
             if self._per_iteration and not self._is_enough_for_another():
                 return
             name = f"t{len(self._points):04d}"
-            self._points.append(next(self._drawn))
+            self._points.append(self._next_point())
             self._trainer.add(name, self._points[-1], TUNING_SEEDS)
             self._rule.begins(name)
             self._steps[name], self._rungs[name] = 0, self._first_rung
+
+    def _next_point(self) -> dict[str, Any]:
+        spec, names = self._task.spec, list(self._steps)
+        known = [
+            self._ended.get(name, KnownPoint(point, is_running=True))
+            for name, point in zip(names, self._points, strict=True)
+        ]
+        return next_point(
+            self._search, spec.space, known, len(known), seed=self._number,
+            num_startup_trials=spec.search.num_startup_trials, check=lambda point: point_hyperparams(spec, point, None),
+        )  # fmt: skip
 
     def _is_enough_for_another(self) -> bool:
         if not self._rungs:
@@ -219,6 +240,8 @@ class _Asha:
                 self._scores[name] = score
             if decision is Decision.STOP:
                 self._rule.ended(standing)
+                level = None if has_ended else int(math.log(steps / self._first_rung, self._factor) + 1e-9)
+                self._ended[name] = KnownPoint(self._points[int(name[1:])], tuple(returns[name]), level=level)
                 self._trainer.remove(name)
                 del self._rungs[name]
                 continue
@@ -226,9 +249,9 @@ class _Asha:
                 self._rungs[name] *= self._factor
 
 
-def asha(task: Task, number: int, trainer: Trainer) -> Tuned:
-    """Run successive halving; see `_Asha`."""
-    return _Asha(task, number, trainer).run()
+def asha(task: Task, number: int, trainer: Trainer, search: str = "random") -> Tuned:
+    """Run successive halving, with the points that a search method chooses; see `_Asha`."""
+    return _Asha(task, number, trainer, search).run()
 
 
 def _standing(name: str, num_env_steps: int, score: float) -> Standing:

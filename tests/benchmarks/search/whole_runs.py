@@ -16,7 +16,7 @@ from typing import Any
 
 from tests.benchmarks.search.pack_trainer import PackTrainer
 from tests.benchmarks.search.runs import Run, finite
-from tests.benchmarks.search.schedulers import Stage, Tuned, task_of, tested, tuned
+from tests.benchmarks.search.schedulers import SEARCH_OF_ASHA, Stage, Tuned, task_of, tested, tuned
 from tests.benchmarks.search.tasks import Task
 from tests.benchmarks.search.trainings import whole_lines
 
@@ -26,7 +26,7 @@ Make = Callable[[Task, str, int], dict[str, Any]]
 def make(task: Task, method: str, number: int) -> dict[str, Any]:
     """Make a run, and test what it found on seeds on which nothing was chosen; returns it as JSON-like data."""
     task = task_of(task, method, number)
-    trainer = PackTrainer(task, in_step=method != "asha")
+    trainer = PackTrainer(task, in_step=method not in SEARCH_OF_ASHA)
     found = tuned(task, method, number, trainer)
     trainer.close()
     trainer = PackTrainer(task)
