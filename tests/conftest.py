@@ -68,12 +68,20 @@ def env_plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def ray_session(env_plugin: None) -> Iterator[None]:
-    """A Ray of two CPUs, started as a sweep starts its own; RLlib would start one without these settings."""
+    """A Ray of two CPUs, started as a sweep starts its own, packs' processes as forks included.
+
+    RLlib would start one without these settings. With Ray's own processes, each of which imports for seconds, the tests of
+    tests/ray take twice as long.
+    """
     import ray
 
+    from tune_jobs.plan.machine import Machine
+    from tune_jobs.ray_tune import local_ray
     from tune_jobs.ray_tune.environment import prepare_environment
+    from tune_jobs.ray_tune.forks import fork_server
 
     prepare_environment()
-    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
-    yield
-    ray.shutdown()
+    with fork_server() as forks, local_ray.without_environments():
+        local_ray.start(Machine(2), forks)
+        yield
+        ray.shutdown()
