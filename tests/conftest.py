@@ -70,8 +70,8 @@ def env_plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def ray_session(env_plugin: None) -> Iterator[None]:
     """A Ray of two CPUs, started as a sweep starts its own, packs' processes as forks included.
 
-    RLlib would start one without these settings. With Ray's own processes, each of which imports for seconds, the tests of
-    tests/ray take twice as long.
+    RLlib would start one without these settings. With processes of Ray alone, each of which imports for seconds,
+    the tests of tests/ray take twice as long.
     """
     import ray
 
