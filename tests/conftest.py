@@ -71,7 +71,7 @@ def ray_session(env_plugin: None) -> Iterator[None]:
     """A Ray of two CPUs, started as a sweep starts its own, packs' processes as forks included.
 
     RLlib would start one without these settings. With processes of Ray alone, each of which imports for seconds,
-    the tests of tests/ray take twice as long.
+    the tests of tests/ray take half as long again.
     """
     import ray
 
