@@ -53,8 +53,8 @@ $(VENV)/installed-bench: $(VENV)/installed
 
 # In four processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
 # each with a Ray of its own, the unit tests, and the others, followed by the third part of tests/ray; with the types
-# beside them. All four take about as long. What the parts print, skipped tests with their reasons too, comes at the end.
-# Processes by the hundred import the same modules: these are compiled once, whatever else the environment says.
+# beside them. Each takes 14 to 20 minutes beside the others. What they print, skipped tests with their reasons too, comes
+# at the end. Processes by the hundred import the same modules: these are compiled once, whatever else the environment says.
 RAY := tests/ray
 # It needs no Ray of the tests' own: it stands where there is time left.
 SERVED := $(RAY)/test_service.py

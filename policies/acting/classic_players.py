@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from policies.acting.policy import Policy
 from policies.envs import calls
 from policies.envs.checked import check_observation, check_reward, is_sound
+from policies.envs.classic import is_classic
 from policies.envs.classic_rows import ClassicRows
 from policies.envs.make import make_vector_env
 
@@ -97,16 +98,18 @@ class RowsPlayer:
     """Plays other classic control than CartPole, whose copies are rows."""
 
     def __init__(self, rows: ClassicRows, env_id: str, seeds: Sequence[int]) -> None:
-        self._rows, self._env_id = rows, env_id
+        self.rows, self._env_id = rows, env_id
         starts = [rows.start(seed=seed) for seed in seeds]
         self.starts = Starts(
             np.array([start.state for start in starts]), np.array([start.observation for start in starts])
         )
 
     @classmethod
-    def make_if_classic(cls, env_id: str, env_args: Mapping[str, Any], seeds: Sequence[int]) -> RowsPlayer | None:
-        """Return a player, or None for any other env, or one in further wrappers."""
-        rows = ClassicRows.make(env_id, env_args)
+    def make_if_classic(
+        cls, scalar_env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any], seeds: Sequence[int]
+    ) -> RowsPlayer | None:
+        """Return a player, or None for any other env, of which none is made, or one in further wrappers."""
+        rows = ClassicRows.make(env_id, env_args) if is_classic(scalar_env) else None
         return None if rows is None else cls(calls.watch_rows(rows), env_id, seeds)
 
     def play(self, policy: Policy, max_episode_steps: int) -> list[tuple[float, int]]:
@@ -126,7 +129,7 @@ class RowsPlayer:
     ) -> list[tuple[float, int]]:
         num = len(states)
         returns, lengths, episodes = np.zeros(num), np.zeros(num, dtype=np.int64), np.arange(num)
-        rows = self._rows
+        rows = self.rows
         rows.put(states, lengths)
         for number in range(1, max_episode_steps + 1):
             observations, rewards, terminated, truncated = rows.step(policy.act_on_rows(observations))
@@ -146,4 +149,4 @@ class RowsPlayer:
 
     def close(self) -> None:
         """Close the environment."""
-        self._rows.close()
+        self.rows.close()

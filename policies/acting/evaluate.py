@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from policies.acting.classic_players import CartPolePlayer, RowsPlayer, Starts
 from policies.acting.policy import Action, NetworkPolicy, Policy
 from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
+from policies.envs.classic_rows import ClassicRows
 from policies.envs.faults import close_env, env_failed
 from policies.envs.make import make_env
 from policies.errors import EnvError, EnvFailedError, SpecError
@@ -104,13 +105,20 @@ class Evaluator:
         self._envs = [make_env(env_id, self.env_args)]
         self.max_episode_steps = episode_cap(self._envs[0], max_episode_steps)
         self._cartpoles = CartPolePlayer.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)
-        self._rows = None if self._cartpoles else RowsPlayer.make_if_classic(env_id, self.env_args, self.seeds)
+        self._classic = (
+            None if self._cartpoles else RowsPlayer.make_if_classic(self._envs[0], env_id, self.env_args, self.seeds)
+        )
 
     @property
     def starts(self) -> Starts | None:
         """The start of each seed's episode in classic control; None for another env or one with wrappers."""
-        player = self._cartpoles or self._rows
+        player = self._cartpoles or self._classic
         return None if player is None else player.starts
+
+    @property
+    def rows(self) -> ClassicRows | None:
+        """The rows that episodes of classic control are played in, but CartPole's; whoever uses them puts his own."""
+        return None if self._classic is None else self._classic.rows
 
     def check(self, policy: Policy) -> None:
         """Check that a policy can act in this environment.
@@ -134,9 +142,9 @@ class Evaluator:
             results = [self._play_alone(policy, seed) for seed in self.seeds]
         elif self._cartpoles is not None:
             results = self._cartpoles.play(policy, self.max_episode_steps)
-        elif self._rows is not None and type(policy) is NetworkPolicy:
+        elif self._classic is not None and type(policy) is NetworkPolicy:
             # Another may give actions of other types or outside of their bounds, which is the environment's to judge.
-            results = self._rows.play(policy, self.max_episode_steps)
+            results = self._classic.play(policy, self.max_episode_steps)
         else:
             results = self._play_side_by_side(policy)
         returns, lengths = zip(*results, strict=True)
@@ -146,8 +154,8 @@ class Evaluator:
         """Close the environments; `run` cannot be called afterwards."""
         for env in self._envs:
             close_env(env)
-        if self._rows is not None:
-            self._rows.close()
+        if self._classic is not None:
+            self._classic.close()
 
     def __enter__(self) -> Self:
         return self

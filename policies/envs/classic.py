@@ -14,10 +14,12 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from gymnasium.envs.classic_control.continuous_mountain_car import Continuous_MountainCarEnv
 from gymnasium.envs.classic_control.mountain_car import MountainCarEnv
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from numpy.typing import NDArray
+from typing_extensions import override
 
 Numbers = NDArray[Any]
 
@@ -59,15 +61,18 @@ def physics_of(env: gym.Env[Any, Any]) -> Physics | None:
     return None if make is None else make(env)
 
 
-class _MountainCar:
-    """Position and velocity."""
+class _OfEnv:
+    """What the physics of all of them have in common: the environment, and its state as it is."""
 
-    def __init__(self, env: MountainCarEnv) -> None:
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env: Any = env
 
     def state(self) -> list[float]:
-        position, velocity = self._env.state
-        return [float(position), float(velocity)]
+        return [float(number) for number in self._env.state]
+
+
+class _MountainCar(_OfEnv):
+    """Position and velocity."""
 
     def step(self, states: NDArray[np.float64], actions: Numbers) -> Stepped:
         env = self._env
@@ -81,15 +86,12 @@ class _MountainCar:
         return Stepped(after, after.T.astype(np.float32), np.full(len(position), -1.0), terminated)
 
 
-class _ContinuousMountainCar:
+class _ContinuousMountainCar(_OfEnv):
     """Position, velocity, and 1 after a reset: the first step is of double precision, the others of single."""
 
-    def __init__(self, env: Continuous_MountainCarEnv) -> None:
-        self._env: Any = env
-
+    @override
     def state(self) -> list[float]:
-        position, velocity = self._env.state
-        return [float(position), float(velocity), 1.0]
+        return [*super().state(), 1.0]
 
     def step(self, states: NDArray[np.float64], actions: Numbers) -> Stepped:
         force = actions[:, 0]
@@ -120,15 +122,8 @@ class _ContinuousMountainCar:
         return np.stack([position, velocity]).astype(np.float32), terminated
 
 
-class _Pendulum:
+class _Pendulum(_OfEnv):
     """Angle and angular velocity."""
-
-    def __init__(self, env: PendulumEnv) -> None:
-        self._env: Any = env
-
-    def state(self) -> list[float]:
-        angle, velocity = self._env.state
-        return [float(angle), float(velocity)]
 
     def step(self, states: NDArray[np.float64], actions: Numbers) -> Stepped:
         env = self._env
@@ -147,14 +142,8 @@ class _Pendulum:
         return Stepped(np.stack([angle, velocity]), observations, -costs, np.zeros(len(angle), dtype=np.bool_))
 
 
-class _Acrobot:
+class _Acrobot(_OfEnv):
     """Two angles and their velocities; the equations are the book's (Sutton and Barto 2018), by Runge-Kutta."""
-
-    def __init__(self, env: AcrobotEnv) -> None:
-        self._env: Any = env
-
-    def state(self) -> list[float]:
-        return [float(number) for number in self._env.state]
 
     def step(self, states: NDArray[np.float64], actions: Numbers) -> Stepped:
         env = self._env
@@ -209,6 +198,11 @@ _PHYSICS: dict[type, Callable[[Any], Physics | None]] = {
     PendulumEnv: _Pendulum,
     AcrobotEnv: _acrobot,
 }
+
+
+def is_classic(env: gym.Env[Any, Any]) -> bool:
+    """Whether an environment, in whatever wrappers, is one that may have rows: of classic control, CartPole too."""
+    return type(env.unwrapped) in {*_PHYSICS, CartPoleEnv}
 
 
 def _cosines(angles: Numbers) -> list[float]:

@@ -51,8 +51,7 @@ class ClassicRows:
     def __init__(self, env: gym.Env[Any, Any], physics: Physics) -> None:
         self._env, self._inner, self._physics = env, env.unwrapped, physics
         self._limit = None if env.spec is None else env.spec.max_episode_steps
-        self.num_state = len(self.start(seed=0).state)
-        self.put(np.zeros((0, self.num_state)), np.zeros(0, dtype=np.int64))
+        self.put(np.zeros((0, len(self.start(seed=0).state))), np.zeros(0, dtype=np.int64))
 
     @classmethod
     def make(cls, env_id: str, env_args: Mapping[str, Any] | None) -> ClassicRows | None:
@@ -67,16 +66,6 @@ class ClassicRows:
             close_env(env)
             return None
         return cls(env, physics)
-
-    @property
-    def observation_space(self) -> gym.Space[Any]:
-        """The observation space of one copy."""
-        return self._env.observation_space
-
-    @property
-    def action_space(self) -> gym.Space[Any]:
-        """The action space of one copy."""
-        return self._env.action_space
 
     @property
     def states(self) -> NDArray[np.float64]:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import ActionSpace, NetworkPolicy, Policy, action_function
 from policies.envs.checked import is_sound
-from policies.envs.classic_rows import ClassicRows
 from policies.errors import TuneJobsError
 from policies.packed.envs.cartpole import CartPoleRows
 from policies.portable.forward import ForwardPass, ForwardPasses
@@ -111,8 +110,8 @@ def _play_together(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Epi
         _UnsoundError: See there.
     """
     starts, num_seeds = evaluator.starts, len(evaluator.seeds)
-    rows: CartPoleRows | ClassicRows | None = CartPoleRows.make(evaluator.env_id, evaluator.env_args)
-    rows = rows or ClassicRows.make(evaluator.env_id, evaluator.env_args)
+    cartpoles = None if evaluator.rows else CartPoleRows.make(evaluator.env_id, evaluator.env_args)
+    rows = evaluator.rows or cartpoles
     assert starts is not None
     assert rows is not None
     by_layout: dict[Any, dict[int, NetworkPolicy]] = {}
@@ -125,7 +124,8 @@ def _play_together(evaluator: Evaluator, policies: Sequence[Policy]) -> list[Epi
     counts = np.full(len(policies), num_seeds, dtype=np.intp)
     observations = np.tile(starts.observations, (len(policies), 1))
     rows.put(np.tile(starts.states, (len(policies), 1)), np.zeros(len(episodes), dtype=np.intp))
-    with contextlib.closing(rows):
+    # The evaluator's own rows stay open.
+    with contextlib.nullcontext() if cartpoles is None else contextlib.closing(cartpoles):
         for _ in range(evaluator.max_episode_steps):
             actions, first = [], 0
             for group in groups:

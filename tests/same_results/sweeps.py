@@ -103,6 +103,7 @@ _ALL = (
            space=_PRIORITIZED_SPACE, stop={"num_env_steps": 800}),
     _sweep("pendulum_packed", "ppo", engine="packed", env="Pendulum-v1", hyperparams=_PENDULUM),
     _sweep("car_packed", "ppo", engine="packed", env="MountainCarContinuous-v0"),
+    _sweep("mountaincar_packed", "dqn", engine="packed", env="MountainCar-v0"),
     _sweep("acrobot_packed", "dqn", engine="packed", env="Acrobot-v1"),
     _sweep("pendulum_rllib", "ppo", engine="rllib", env="Pendulum-v1", hyperparams=_PENDULUM),
     _sweep("pixels_rllib", "ppo", engine="rllib", env={"id": "CartPole-v1", "pixels": True}, hyperparams=_PIXELS,

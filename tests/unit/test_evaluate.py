@@ -80,6 +80,19 @@ def test_rows_of_classic_control_play_the_scalar_env_s_episodes(env_id: str, mon
         assert evaluate_many(evaluator, some) == expected
 
 
+def test_of_another_env_none_is_made_to_see_whether_it_has_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def counted(env_id: str, *args: Any, **kwargs: Any) -> Any:
+        made.append(env_id)
+        return make_env(env_id, *args, **kwargs)
+
+    for module in ("policies.acting.evaluate", "policies.envs.classic_rows"):
+        monkeypatch.setattr(f"{module}.make_env", counted)
+    Evaluator("TestWalk-v0", None, (1, 2)).close()
+    assert made == ["TestWalk-v0"]
+
+
 def test_a_watched_process_says_that_it_steps_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     number = os.memfd_create("page")
     os.truncate(number, calls.PAGE_BYTES)

@@ -22,7 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from policies.envs.checked import reward_as_number
+from policies.envs.classic import is_classic
 from policies.envs.classic_rows import ClassicRows
+from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import num_masked, sample
 from policies.errors import EnvError
@@ -99,7 +101,10 @@ def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
     """
     from policies.packed.envs.cartpole import CartPoleRows
 
-    rows = CartPoleRows.make(env_id, env_args) or ClassicRows.make(env_id, env_args)
+    env = make_env(env_id, env_args)
+    may_have_rows = is_classic(env)
+    close_env(env)
+    rows = (CartPoleRows.make(env_id, env_args) or ClassicRows.make(env_id, env_args)) if may_have_rows else None
     if rows is not None:
         rows.close()
         return StepTime(_vectorised_step_us(env_id, env_args), is_vectorised=True)

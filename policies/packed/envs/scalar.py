@@ -20,11 +20,11 @@ from policies.envs.make import make_env
 from policies.envs.spaces import observation_dtype
 from policies.envs.tallies import Tally, tally_of
 from policies.errors import EnvError
-from policies.packed.envs.classic_host import ClassicHost
+from policies.packed.envs.classic_sub_envs import ClassicSubEnvs
 from policies.packed.envs.penalty import Penalty
 from policies.packed.envs.process import ProcessHost
 from policies.packed.envs.rows import MemberRows, Rows
-from policies.packed.envs.sub_envs import HereHost, Host, HostDiedError, SubStep
+from policies.packed.envs.sub_envs import HereHost, Host, HostDiedError, SubEnvs, SubStep
 from policies.packed.envs.vector import Step
 
 _NUM_SEEDS = 2**32  # Gymnasium takes larger seeds, but many environments do not
@@ -82,7 +82,7 @@ class ScalarEnvs:
         self._penalty = Penalty.find(env_id, self._env_args, failure_penalty)
         self._members = MemberRows(num_envs)
         self._num_processes = num_processes
-        self._parts: list[_Part] = [] if rows is None else [_Part(ClassicHost(rows, env_id))]
+        self._parts: list[_Part] = [] if rows is None else [_Part(HereHost(ClassicSubEnvs(rows, env_id)))]
         self._suspects: set[str] = set()
         self._tallies: dict[str, Tally] = {}
         self.observations: NDArray[Any] = self._zeros(0)
@@ -206,8 +206,9 @@ class ScalarEnvs:
         return [(part, more) for part, more in zip(shared, places, strict=True) if more]
 
     def _make_host(self) -> Host:
-        make = ProcessHost if self._num_processes else HereHost
-        return make(self._env_id, self._env_args)
+        if self._num_processes:
+            return ProcessHost(self._env_id, self._env_args)
+        return HereHost(SubEnvs(self._env_id, self._env_args))
 
     def _find_rows(self) -> None:
         for part in self._parts:

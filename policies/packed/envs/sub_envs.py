@@ -134,25 +134,14 @@ class SubEnvs:
             except EnvError as error:
                 errors[one.member_id] = error
         if not (is_sound(rewards) and is_sound(finals)):
-            self._find_unsound(rewards, finals, lengths, errors)
+            owners = [one.member_id for one in self._envs]
+            errors = find_unsound(owners, rewards, finals, lengths, self._env_id) | errors
         return SubStep(finals, firsts, rewards, terminated, truncated, errors)
 
     def close(self) -> None:
         """Close all sub-environments."""
         _close(self._envs)
         self._envs = []
-
-    def _find_unsound(
-        self, rewards: NDArray[np.float32], finals: NDArray[Any], lengths: Sequence[int], errors: dict[str, EnvError]
-    ) -> None:
-        """Add the members whose rewards or observations are not finite to `errors`."""
-        for place, one in enumerate(self._envs):
-            if one.member_id not in errors:
-                try:
-                    check_reward(float(rewards[place]), self._env_id, lengths[place])
-                    check_observation(finals[place], self._env_id, lengths[place])
-                except EnvError as error:
-                    errors[one.member_id] = error
 
     def _step(self, one: _SubEnv, action: Any, final: NDArray[Any]) -> tuple[float, bool, bool]:
         """Step one sub-environment; its observation goes into `final`."""
@@ -187,11 +176,38 @@ class SubEnvs:
         return env_failed(f"{self._env_id} raised an error in {method}()", error)
 
 
-class HereHost:
-    """Steps sub-environments in this process."""
+def find_unsound(
+    owners: Sequence[str], rewards: NDArray[Any], finals: NDArray[Any], lengths: Sequence[int], env_id: str
+) -> dict[str, EnvError]:
+    """Return the errors of members whose rewards or observations are not finite.
 
-    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
-        self._sub_envs = SubEnvs(env_id, env_args)
+    Args:
+        owners: The member of each sub-environment.
+        rewards: The rewards of a step, one for each.
+        finals: What each observed after it.
+        lengths: The steps of each one's episode.
+        env_id: Gymnasium id, for messages.
+    """
+    errors: dict[str, EnvError] = {}
+    for place, owner in enumerate(owners):
+        if owner not in errors:
+            try:
+                check_reward(float(rewards[place]), env_id, lengths[place])
+                check_observation(finals[place], env_id, lengths[place])
+            except EnvError as error:
+                errors[owner] = error
+    return errors
+
+
+class HereHost:
+    """Steps sub-environments in this process.
+
+    Args:
+        sub_envs: `SubEnvs`, or what has its methods.
+    """
+
+    def __init__(self, sub_envs: Any) -> None:
+        self._sub_envs = sub_envs
         self._asked: tuple[str, tuple[Any, ...]] = ("close", ())
 
     def send(self, method: str, *args: Any) -> None:

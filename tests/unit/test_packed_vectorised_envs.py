@@ -1,0 +1,106 @@
+"""The environments that a pack steps in one object: CartPole's own vectorised version, and which have none."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
+from test_packed_envs import Actor, N, assert_equal_bits, make, own_modules, seen_by
+
+from policies.envs.make import make_env
+from policies.errors import EnvError
+from policies.packed.envs.make import make_packed_envs
+
+__all__ = ["make", "own_modules"]
+
+
+@pytest.mark.parametrize("env_args", [{"max_episode_steps": 25}, {"sutton_barto_reward": True}])
+def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make: Any, env_args: Any) -> None:
+    envs = make("CartPole-v1", "vectorised", env_args=env_args, members={"a": 1, "b": 2})
+    scalars = [make_env("CartPole-v1", env_args) for _ in range(2 * N)]
+
+    def restart(row: int) -> None:
+        scalars[row].reset(seed=0)
+        cast("Any", scalars[row].unwrapped).state = envs._rows.states[row].copy()
+
+    for row in range(2 * N):
+        restart(row)
+    rng = np.random.default_rng(0)
+    num_ended = {"terminated": 0, "truncated": 0}
+    for _ in range(300):
+        actions = rng.integers(0, 2, 2 * N)
+        step = envs.step(actions)
+        for row, env in enumerate(scalars):
+            observation, reward, terminated, truncated, _ = env.step(int(actions[row]))
+            np.testing.assert_array_equal(step.final_observations[row], observation)
+            assert (step.rewards[row], step.terminated[row], step.truncated[row]) == (reward, terminated, truncated)
+            num_ended["terminated"] += terminated
+            num_ended["truncated"] += truncated
+            if terminated or truncated:
+                restart(row)
+    assert num_ended["terminated"] > 10
+    assert (num_ended["truncated"] > 10) is ("max_episode_steps" in env_args)
+
+
+def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make: Any) -> None:
+    envs = make("CartPole-v1", "vectorised", num_envs=50, env_args={"max_episode_steps": 2}, members={"a": 1, "b": 2})
+    starts = [envs.observations]
+    for _ in range(20):
+        step = envs.step(np.zeros(100, dtype=np.int64))
+        starts += [step.observations] if step.truncated.all() else []
+    every = np.concatenate(starts)
+    assert len(every) == 11 * 100
+    assert len(np.unique(every, axis=0)) == len(every)
+    assert np.abs(every).max() <= 0.05
+    assert np.abs(every).max() > 0.049
+    assert np.abs(every.mean(axis=0)).max() < 0.004
+
+
+def test_what_a_member_gets_does_not_depend_on_how_long_the_stretches_are(make: Any) -> None:
+    traces = []
+    every = dict.fromkeys(range(60), 1)
+    for stretches in ({0: 60}, every, {0: 7, 7: 20, 27: 33}, {0: 100}, {}, {0: 10, 3: 20, 17: 2, 30: 8, 33: 40}):
+        envs = make("CartPole-v1", "vectorised", env_args={"max_episode_steps": 5}, members={"a": 3})
+        actor, trace = Actor(envs.action_space, 0), []
+        for index in range(60):
+            if index in stretches:
+                envs.begin(stretches[index])
+            trace.append(seen_by(envs, envs.step(actor()), "a"))
+        traces.append(trace)
+    for trace in traces[1:]:
+        assert_equal_bits(trace, traces[0])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_args"),
+    [
+        ("policy_factory:Walk", {}),
+        ("CartPole-v1", {"pixels": True}),
+        ("CartPole-v1", {"frame_stack": 2}),
+        ("Pendulum-v1", {"frame_stack": 2}),
+        ("Acrobot-v1", {"pixels": True}),
+    ],
+)
+def test_only_plain_classic_control_is_vectorised(env_id: str, env_args: Any) -> None:
+    with pytest.raises(EnvError, match="no vectorised version"):
+        make_packed_envs(env_id, env_args, 2, kind="vectorised")
+
+
+def test_a_cartpole_of_somebody_s_own_is_not_vectorised() -> None:
+    class LowGravity(CartPoleEnv):
+        """Its registry entry has forgotten that Gymnasium's vectorised version does not know of this."""
+
+    gym.register(
+        "TestLowGravity-v0",
+        cast("Any", LowGravity),
+        max_episode_steps=20,
+        vector_entry_point=cast("Any", CartPoleVectorEnv),
+    )
+    try:
+        with pytest.raises(EnvError, match="no vectorised version"):
+            make_packed_envs("TestLowGravity-v0", None, 2, kind="vectorised")
+    finally:
+        del gym.registry["TestLowGravity-v0"]
