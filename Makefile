@@ -1,7 +1,7 @@
 # make sweep   install into .venv, run the tutorial's sweep, show where its results lie
 # make test    install the test tools too, then lint, types and every test that can run here, but for the slowest
 # make test-slow   those tests, which say that they were skipped in `make test`
-# make unit    the tests of tests/unit, which start next to nothing and take under a minute: while one works
+# make unit    the tests of tests/unit, which start next to nothing, in some five minutes: while one works
 # make learn   every preset with a score to reach, over five training seeds, in one table of score against target
 # make kills   kill the drivers of small sweeps at many moments, resume them at once, check what is there: one table;
 #              then service, drivers and database a hundred times
@@ -51,9 +51,9 @@ $(VENV)/installed-bench: $(VENV)/installed
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
 	@touch $@
 
-# In four processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
-# each with a Ray of its own, the unit tests, and the others, followed by the third part of tests/ray; with the types
-# beside them. Each takes 14 to 20 minutes beside the others. What they print, skipped tests with their reasons too, comes
+# In five processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
+# each with a Ray of its own, two of the unit tests, and the others, followed by the third part of tests/ray; with the
+# types beside them. Each takes 14 to 20 minutes beside the others. What they print, skipped tests with their reasons too, comes
 # at the end. Processes by the hundred import the same modules: these are compiled once, whatever else the environment says.
 RAY := tests/ray
 # It needs no Ray of the tests' own: it stands where there is time left.
@@ -66,7 +66,7 @@ test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
 	$(PYTEST) $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
 	$(PYTEST) $(RAY)/test_[p-r]*.py $(SERVED) > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
-	$(PYTEST) tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
+	$(PYTEST) --numprocesses=2 tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
 	$(PYTEST) $(OTHERS) $(LAST); others=$$?; \
 	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
 	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
