@@ -1,7 +1,9 @@
 """Processes of a local Ray that are forked from one that has imported what packs need."""
 
+import array
 import json
 import os
+import socket
 import subprocess
 import sys
 import tempfile
@@ -100,6 +102,25 @@ def test_ray_starts_a_process_itself_where_it_reads_other_settings(address: str,
 
 def test_ray_starts_its_processes_itself_where_nobody_answers(tmp_path: Path) -> None:
     assert asked(tmp_path, str(tmp_path / "nobody")) == {}
+
+
+def test_a_forked_process_that_who_asked_does_not_take_does_nothing(address: str, tmp_path: Path) -> None:
+    """It would be a second one for one command: who asked becomes Ray's own."""
+    asked(tmp_path, address)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection, (tmp_path / "told").open("wb") as told:
+        connection.connect(address)
+        request = {"command": [str(tmp_path / "default_worker.py")], "environment": dict(os.environ), "folder": "/",
+                   "blocked": [], "ignored": [], "oom_score_adj": "0"}  # fmt: skip
+        streams = array.array("i", [told.fileno()] * 3)
+        connection.sendmsg([json.dumps(request).encode() + b"\n"], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, streams)])
+        process = Path("/proc", connection.recv(32).decode())
+        time.sleep(0.2)
+        assert process.exists()
+    until = time.monotonic() + 10
+    while process.exists():
+        assert time.monotonic() < until, "it lives on"
+        time.sleep(0.02)
+    assert (tmp_path / "told").read_text() == ""
 
 
 def test_forked_processes_end_with_the_one_that_they_are_forked_from(tmp_path: Path) -> None:

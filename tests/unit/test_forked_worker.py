@@ -1,11 +1,15 @@
 """Which of Ray's commands are done by a fork, and which are left to Ray."""
 
 import json
+import socket
 import sys
+import threading
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tune_jobs.ray_tune.forked_worker import forkable
+from tune_jobs.ray_tune.forked_worker import ask, forkable
 
 PROGRAM = "/ray/workers/default_worker.py"
 
@@ -48,3 +52,43 @@ def test_a_command_that_does_more_is_left_to_ray(options: list[str]) -> None:
 @pytest.mark.parametrize("program", ["-s", "/ray/util/client/server"])
 def test_another_program_is_left_to_ray(program: str) -> None:
     assert forkable(command(program=program)) is None
+
+
+@pytest.mark.parametrize("num_answered", [0, 1])
+def test_an_answer_counts_that_comes_before_who_asked_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, num_answered: int
+) -> None:
+    """On a machine with much to do: else there were the forked process and Ray's own for one command."""
+    has_answered, told = threading.Event(), []
+
+    class Slow(socket.socket):
+        def sendmsg(self, *content: Any) -> int:
+            sent = super().sendmsg(*content)
+            assert has_answered.wait(10)
+            return sent
+
+    def answer(listener: socket.socket) -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while not connection.recv(1 << 16).endswith(b"\n"):
+                pass
+            forked = connection.dup()
+            connection.sendall(b"7" * num_answered)
+        if not num_answered:
+            forked.close()
+        has_answered.set()
+        if num_answered:
+            with forked:
+                told.append(forked.recv(1))
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(tmp_path / "asked"))
+        listener.listen()
+        thread = threading.Thread(target=answer, args=[listener])
+        thread.start()
+        monkeypatch.setattr(socket, "socket", Slow)
+        assert ask(str(tmp_path / "asked"), [PROGRAM]) == bool(num_answered)
+        monkeypatch.undo()
+        thread.join(10)
+    assert not thread.is_alive()
+    assert told == [b"\n"] * num_answered

@@ -151,6 +151,24 @@ def test_packs_are_of_one_size_and_of_trainings_that_share_stacks(
     assert len([size for size, _ in itertools.groupby(in_order)]) == len(set(in_order))
 
 
+def test_packs_of_dqn_take_nearly_as_long_as_their_batches_say(tmp_path: Path) -> None:
+    task = TASKS["acrobot-dqn"]
+    point = next_point("random", task.spec.space, [], 0, seed=0)
+    missing = [
+        Wanted(point | {"train_batch_size": size, "lr": 0.001 * (place + 1)}, seed)
+        for place, size in enumerate((64, 256, 64, 64, 256, 64))
+        for seed in TUNING_SEEDS
+    ]
+
+    def rows(pack: list[Wanted]) -> int:
+        return sum(module.COST_OF_UPDATE + item.point["train_batch_size"] for item in pack)
+
+    first, second = Trainings(task, tmp_path / "made.jsonl", 2)._packs(missing)
+    assert sorted(item.key for item in (*first, *second)) == sorted(item.key for item in missing)
+    assert abs(rows(first) - rows(second)) <= module.COST_OF_UPDATE + 256
+    assert sorted(map(len, (first, second))) == [6, 12]
+
+
 def test_a_line_that_was_not_written_whole_is_made_again(tmp_path: Path) -> None:
     file = tmp_path / "made.jsonl"
     whole = json.dumps({"point": {"lr": 0.5}, "seed": 1, "return": 2.0}) + "\n"

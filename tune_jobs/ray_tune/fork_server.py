@@ -79,7 +79,7 @@ def main(listener: socket.socket, early: list[str], late: list[str]) -> Callable
             # Nothing is forked for what is announced. Those who ask with other settings, or wait no more, become Ray's
             # own command.
             if "command" in asked and _settings_of_ray(asked) == known and _is_waiting(connection):
-                pid = _fork(kernel)
+                pid = _fork(kernel, connection)
             if pid == 0:
                 listener.close()
                 connection.close()
@@ -94,15 +94,26 @@ def _is_waiting(connection: socket.socket) -> bool:
     return not select.select([connection], [], [], 0)[0]
 
 
-def _fork(kernel: ctypes.CDLL) -> int:
-    """Fork this process; return 0 in the forked one, which ends with this one, else its id."""
+def _is_taken(connection: socket.socket) -> bool:
+    """Wait until who asked says that the forked process is the one, or that it is not, by its end."""
+    connection.settimeout(None)
+    with contextlib.suppress(OSError):
+        return bool(connection.recv(1))
+    return False
+
+
+def _fork(kernel: ctypes.CDLL, connection: socket.socket) -> int:
+    """Fork this process; return 0 in the forked one, which ends with this one, else its id.
+
+    The forked one returns when who asked has taken it; it ends where that is gone.
+    """
     server = os.getpid()
     pid = os.fork()
     if pid == 0:
         # Ray 2.60 ends what is left of a process's group with it.
         os.setpgid(0, 0)
         kernel.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != server:
+        if os.getppid() != server or not _is_taken(connection):
             os._exit(1)
     return pid
 

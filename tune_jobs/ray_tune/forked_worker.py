@@ -65,10 +65,16 @@ def ask(address: str, command: list[str]) -> bool:
             content = json.dumps(asked).encode() + b"\n"
             streams = array.array("i", [0, 1, 2])
             sent = connection.sendmsg([content], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, streams)])
-            connection.sendall(content[sent:])
+            if rest := content[sent:]:
+                # To send nothing is to fail where the answer is here, and who answered has closed.
+                connection.sendall(rest)
             connection.settimeout(_PATIENCE_S)
             # It answers when it has imported everything.
-            return bool(connection.recv(32))
+            if not connection.recv(32):
+                return False
+            # The forked process begins when it is told to, and ends if it is not: there are never two for a command.
+            connection.sendall(b"\n")
+            return True
     except OSError:
         return False
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from policies.hyperparams import DQNHyperparams, Hyperparams
 from tests.benchmarks.search.pack_trainer import PackTrainer
 from tests.benchmarks.search.tasks import Task
 from tune_jobs.plan.engine_choice import pack_key
@@ -24,6 +25,9 @@ from tune_jobs.plan.points import point_hyperparams
 
 MAX_AT_ONCE = 24
 """Trainings in a pack; more gain little, and one that a kill takes with it is lost."""
+
+COST_OF_UPDATE = 100
+"""What an update of DQN takes besides its batch, in rows of a batch."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +78,17 @@ class Trainings:
             self._pool = None
 
     def _packs(self, missing: Sequence[Wanted]) -> list[list[Wanted]]:
-        """Divide trainings among packs of nearly one size: those that can share a stack stand side by side."""
-        ordered = sorted(missing, key=lambda item: repr(pack_key(point_hyperparams(self._task.spec, item.point, 0))))
+        """Divide trainings among packs that take nearly as long: those that can share a stack stand side by side."""
+        hyperparams = {item.key: point_hyperparams(self._task.spec, item.point, 0) for item in missing}
+        ordered = sorted(missing, key=lambda item: repr(pack_key(hyperparams[item.key])))
         rounds = math.ceil(len(ordered) / (MAX_AT_ONCE * self._num_processes))
         count = min(rounds * self._num_processes, len(ordered))
-        ends = [len(ordered) * number // count for number in range(count + 1)]
-        return [ordered[first:end] for first, end in itertools.pairwise(ends)]
+        ends = list(itertools.accumulate(_cost(hyperparams[item.key]) for item in ordered))
+        packs: list[list[Wanted]] = [[] for _ in range(count)]
+        for item, end in zip(ordered, ends, strict=True):
+            middle = end - _cost(hyperparams[item.key]) / 2
+            packs[int(count * middle / ends[-1])].append(item)
+        return [pack for pack in packs if pack]
 
     def _make(self, missing: Sequence[Wanted]) -> None:
         if self._pool is None:
@@ -96,6 +105,15 @@ class Trainings:
                     self._known[item.key] = value
                     file.write(json.dumps({"point": dict(item.point), "seed": item.seed, "return": value}) + "\n")
                 file.flush()
+
+
+def _cost(hyperparams: Hyperparams) -> float:
+    """Return about how long a training of a task takes beside its others.
+
+    An update of DQN's takes as long for itself as for some 100 rows of its batch; PPO trains each of its rows equally
+    often whatever the batch.
+    """
+    return COST_OF_UPDATE + hyperparams.train_batch_size if isinstance(hyperparams, DQNHyperparams) else 1.0
 
 
 def train(task: Task, wanted: Sequence[tuple[dict[str, Any], int]]) -> list[float | None]:
