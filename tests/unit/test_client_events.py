@@ -9,12 +9,14 @@ import pytest
 from cutting_proxy import cutting_proxy
 from live_service import Live, live, wait_until  # noqa: F401 (a fixture)
 from services import FAKE
+from sqlalchemy.exc import OperationalError
 from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError, NotFoundError, TuneJobsError
 from tune_jobs.client import Client, Event, NoServiceError, event_stream
 from tune_jobs.client import client as client_module
 from tune_jobs.client.event_stream import Parser
+from tune_jobs.client.problems import UnavailableError
 from tune_jobs.service.views import SweepView
 
 # ruff: noqa: F811 - fixtures are named as arguments
@@ -195,6 +197,43 @@ def test_a_job_is_followed_to_its_end(live: Live, monkeypatch: pytest.MonkeyPatc
         assert now.message == "all is well"
         # One that has ended already.
         assert [found.outcome for _, found in client.job_events(job)] == ["completed"]
+
+
+def test_a_database_that_is_away_for_a_moment_is_no_end(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is wrong with the sweep, and whoever follows it for hours meets a database that is started again."""
+    monkeypatch.setattr(SweepView, "interval_s", 0.05)
+    queue, away = live.service.queue, threading.Event()
+    looked: list[str] = []
+
+    def look(name: str) -> Callable[..., Any]:
+        real = getattr(queue, name)
+
+        def found(*arguments: Any, **how: Any) -> Any:
+            if away.is_set():
+                looked.append(name)
+                raise OperationalError(None, None, Exception("it is being started again"))
+            return real(*arguments, **how)
+
+        return found
+
+    for name in ("job", "jobs"):
+        monkeypatch.setattr(queue, name, look(name))
+    with Client(live.url) as client:
+        job = client.submit(FAKE, name="mine").job
+        away.set()
+        back = threading.Timer(1.0, away.clear)
+        back.start()
+        queue.request_stop("mine")
+        assert client.wait("mine", job=job, timeout_s=20).job.outcome == "cancelled"
+        assert "job" in looked
+        back.join()
+        away.set()
+        client._patience_s = 0.5
+        with pytest.raises(UnavailableError, match="database can't be used just now"):
+            client.wait("mine", job=job)
+        with pytest.raises(UnavailableError, match="database can't be used just now"):
+            list(client.events("mine"))
+    away.clear()
 
 
 def test_waiting_ends_with_the_sweep(live: Live) -> None:

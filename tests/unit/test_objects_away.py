@@ -125,6 +125,25 @@ def test_a_holder_whose_beats_answers_are_lost_keeps_the_lock(faults: Faults, bu
     assert not is_leased(bucket, "lock")
 
 
+def test_a_holder_elsewhere_is_watched_once(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A service asks at each look, of each sweep."""
+    monkeypatch.setattr(lease, "_is_here", lambda holder: None)
+
+    def took(expected: bool, **how: float) -> float:
+        began = time.monotonic()
+        assert is_leased(bucket, "lock", 1.0, **how) is expected
+        return time.monotonic() - began
+
+    tag = bucket.put("lock", lease._sign("another", 0), is_new=True)
+    assert took(expected=False) >= 1.0
+    assert took(expected=False) < 0.5
+    bucket.put("lock", lease._sign("another", 1), over=tag)
+    assert took(expected=True) < 0.5
+    # Who wants the lock makes sure; and a sign of life is believed for some time only.
+    assert took(expected=False, believed_s=0.0) >= 0.5
+    assert took(expected=False, believed_s=0.5) < 0.5
+
+
 @pytest.mark.parametrize("is_elsewhere", [False, True])
 def test_a_holder_that_was_killed_is_replaced(
     bucket: Bucket, monkeypatch: pytest.MonkeyPatch, is_elsewhere: bool
@@ -208,3 +227,15 @@ def test_what_is_no_place_is_an_error_with_a_hint(text: str) -> None:
     with pytest.raises(SpecError) as raised:
         ObjectUrl.parse(text)
     assert raised.value.hint
+
+
+def test_the_folder_of_a_sweep_is_removed_with_what_opened_it() -> None:
+    """At once, and not when garbage is collected: a service opens a sweep at each look."""
+    sweep = ObjectSweep(ObjectUrl.parse("s3://bucket/sweeps/mine"))
+    trial = sweep.trial("t0000")
+    own = sweep._parts.own()
+    (own / "made").mkdir()
+    del sweep
+    assert own.is_dir()
+    del trial
+    assert not own.exists()

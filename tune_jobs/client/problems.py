@@ -17,12 +17,18 @@ if TYPE_CHECKING:
 
 PROBLEM = "application/problem+json"
 _SHOWN = 60
+_SOON_S = 30
+"""Seconds after which a service says that it is to be asked again, where what is wrong may pass by itself."""
 _NOTHING_THERE = ("There is nothing at this path.", "Not Found")
 """What is answered where there is no such route; a sweep that is not there is told in other words."""
 
 
 class NoServiceError(CannotRunError):
     """Nothing answers at the address, or what does is no service of tune-jobs."""
+
+
+class UnavailableError(NoServiceError):
+    """The service is there, and can't answer just now, such as while its database is started again."""
 
 
 class LostConnectionError(CannotRunError):
@@ -133,7 +139,13 @@ def refusal(url: str, asked: str, answer: httpx2.Response) -> TuneJobsError:
     if status == 429 and not hint:
         wait = answer.headers.get("retry-after", "")
         hint = f"Try again in {wait} s." if wait.isdecimal() else "Try again later."
+    if status == 503 and _is_soon(answer.headers.get("retry-after", "")):
+        return UnavailableError(message, hint)
     return _kind(status, told.get("error"))(message, hint)
+
+
+def _is_soon(retry_after: str) -> bool:
+    return retry_after.isdecimal() and int(retry_after) <= _SOON_S
 
 
 def _kind(status: int, name: object) -> type[TuneJobsError]:

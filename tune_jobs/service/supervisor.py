@@ -170,7 +170,8 @@ class Supervisor:
         """Make queue and folders agree, after a start: folders are the truth.
 
         A job whose sweep was never written is forgotten. Sweeps that were written but not begun, or whose driver was
-        killed, and that have no job, get one: the database was lost, or they were made by somebody else's hands.
+        killed, and that have no job, get one: the database was lost, or they were made by somebody else's hands. Those
+        whose job was stopped, or failed, wait for somebody who resumes them.
         """
         open_jobs = self._queue.jobs("creating", "waiting", "running")
         for job in open_jobs:
@@ -182,15 +183,16 @@ class Supervisor:
                 self._queue.forget(job.id)
         known = {job.sweep for job in open_jobs}
         ours = {holder.sweep for holder in held_jobs(self._where.service_folder)}
+        last = {job.sweep: job for job in self._queue.jobs("ended")}
         for sweep in self._storage.sweeps():
             if sweep.name in known or (sweep.is_driven() and sweep.name not in ours):
                 continue
             try:
-                state = sweep.read_record().state
+                record = sweep.read_record()
             except TuneJobsError as error:
                 _log.warning("Sweep %s is left alone: %s", sweep.name, error, extra={"sweep": sweep.name})
                 continue
-            if state in ("created", "running"):
+            if record.state in ("created", "running") and not _is_over(last.get(sweep.name), record.created_at):
                 self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.num_cpus)
         self._remove_files()
 
@@ -212,8 +214,11 @@ class Supervisor:
             del self._children[pid]
         for job in self._queue.jobs("running"):
             self._look_at(job)
+        # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
+        free = {job.sweep for job in self._queue.jobs("waiting")} - {job.sweep for job in self._queue.jobs("running")}
+        free = {name for name in free if self._may_run(name)}
         while not self._draining.is_set():
-            claimed = self._queue.claim(self._where.num_cpus, self._may_run)
+            claimed = self._queue.claim(self._where.num_cpus, free.__contains__)
             if claimed is None:
                 break
             self._start(claimed)
@@ -377,6 +382,14 @@ class Supervisor:
 
     def _sweep(self, name: str) -> Sweep:
         return self._storage.sweep(name)
+
+
+def _is_over(job: Job | None, created_at: float) -> bool:
+    """Whether a sweep stays as the last of its jobs left it, which somebody stopped or which failed.
+
+    A job that ended before the sweep was created was another's of the same name.
+    """
+    return job is not None and job.outcome in ("stopped", "cancelled", "failed") and (job.ended_at or 0.0) >= created_at
 
 
 def _wait_s(num_deaths: int) -> float:

@@ -85,7 +85,7 @@ class Follower:
             return self.log.last_id, curves
 
     def _run(self) -> None:
-        wait_s = self._view.interval_s
+        wait_s, has_failed = self._view.interval_s, False
         while not self._over.wait(wait_s):
             began = time.monotonic()
             if self.is_watched:
@@ -94,20 +94,23 @@ class Follower:
                 break
             try:
                 with self._looking, impatient():
-                    self.log.add(self._view.changes())
+                    changes = self._view.changes()
+                    # A look that failed may have taken changes with it.
+                    self.log.add([*changes, ("reset", {})] if has_failed else changes)
             except NotFoundError as error:
                 if not isinstance(error, CheckpointError):
                     self.log.add([("deleted", {})])
                     break
                 _log.warning("%s can't be followed just now: %s", self._what, error)
-                wait_s = _MOST_WAIT_S
+                wait_s, has_failed = _MOST_WAIT_S, True
             except CannotRunError as error:
                 _log.warning("%s can't be followed just now: %s", self._what, error)
-                wait_s = _MOST_WAIT_S
+                wait_s, has_failed = _MOST_WAIT_S, True
             except Exception:  # noqa: BLE001 (such as a database that is away for a while)
                 _log.exception("%s could not be looked at; it is tried again.", self._what)
-                wait_s = _MOST_WAIT_S
+                wait_s, has_failed = _MOST_WAIT_S, True
             else:
+                has_failed = False
                 least_s = max(self._view.interval_s, self.log.num_listeners * _FOR_EACH_S)
                 wait_s = min(_MOST_WAIT_S, max(least_s, (time.monotonic() - began) / _SHARE))
         self.end()

@@ -40,6 +40,9 @@ from tune_jobs.training.registry import engine_of_checkpoint
 # The first seed of `evaluate` if no sweep gives one; it is never one of training, evaluation or confirmation.
 FRESH_SEED = 2**31
 
+_handed_out: list[Sweep] = []
+"""Sweeps of which callers have a folder."""
+
 
 @guarding()
 def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
@@ -261,6 +264,8 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
         else:
             record = choose_best(store).checkpoint
         folder = store.checkpoint_folder(record)
+        # Of a sweep in an object store, it is removed with the store.
+        _handed_out.append(store)
     verify_checkpoint(folder)
     return folder
 

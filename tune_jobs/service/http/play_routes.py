@@ -24,6 +24,7 @@ from tune_jobs.service.player import LEAST_SPEED, MAX_STEPS, MOST_SPEED
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
 from tune_jobs.spec.file import stored_spec
+from tune_jobs.store.contract import Sweep
 
 router = APIRouter(prefix="/api/v1/sweeps/{name}", tags=["watch it play"])
 
@@ -52,18 +53,19 @@ class _Play(StreamingResponse):
 
     Args:
         request: What is played, see `player.play`.
+        sweep: The sweep that its policy is of, which is kept while it is played.
         folder: Where its process begins.
         limit: How many episodes may be played at once.
     """
 
     media_type = "text/event-stream"
 
-    def __init__(self, request: dict[str, Any], folder: str, limit: int) -> None:
+    def __init__(self, request: dict[str, Any], sweep: Sweep, folder: str, limit: int) -> None:
         # An abandoned connection ends the generator, and with it the process.
         super().__init__(
             self._events(request, folder), headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         )
-        self._limit = limit
+        self._limit, self._sweep = limit, sweep
         self.pid: int | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -135,12 +137,19 @@ async def play(
     start: Annotated[int, Query(ge=0, le=MAX_STEPS, description="The first env step that is told.")] = 0,
 ) -> _Play:
     """Play one greedy episode: the events `info`, `step` after step, and `end`, or `problem`."""
-    request = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
+    request, sweep = await anyio.to_thread.run_sync(_request, service, name, trial, iteration, random)
     told = {**request, "seed": seed, "speed": speed, "start": start}
-    return _Play(told, str(service.config.working_folder), service.config.limits.players)
+    return _Play(told, sweep, str(service.config.working_folder), service.config.limits.players)
 
 
-def _request(service: Service, name: str, trial: str | None, iteration: int | None, random: bool) -> dict[str, Any]:  # noqa: FBT001
+def _request(
+    service: Service,
+    name: str,
+    trial: str | None,
+    iteration: int | None,
+    random: bool,  # noqa: FBT001
+) -> tuple[dict[str, Any], Sweep]:
+    """Return what is played, and the sweep, with which the policy's files may be removed."""
     record = service.statuses.see(name).status.sweep
     spec = stored_spec(record)
     sweep = service.storage.sweep(name)
@@ -157,7 +166,8 @@ def _request(service: Service, name: str, trial: str | None, iteration: int | No
             raise NotFoundError(f"Trial {trial} of sweep {name} has no such checkpoint: {has}.")
         policy = str(sweep.trial(trial).checkpoint_folder(kept[-1] if iteration is None else iteration))
     modules = sorted({*service.config.modules, *record.allowed_modules})
-    return {"policy": policy, "env_id": spec.env.id, "env_args": spec.env.wrapped_args, "modules": modules}
+    request = {"policy": policy, "env_id": spec.env.id, "env_args": spec.env.wrapped_args, "modules": modules}
+    return request, sweep
 
 
 def _event(kind: str, data: Any) -> str:

@@ -14,6 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from policies.errors import CannotRunError
@@ -53,30 +54,60 @@ def leased(bucket: Bucket, key: str, message: str, hint: str, *, is_first: bool 
         beating.end()
 
 
-def is_leased(bucket: Bucket, key: str, watch_s: float = 2.5 * _BEAT_S) -> bool:
-    """Whether a process holds the lock; for a holder elsewhere that may be gone, this takes some seconds.
+@dataclass(frozen=True)
+class _Sighting:
+    """What this process has read of a lock last."""
+
+    data: bytes
+    since: float
+    """When it was read first, by `time.monotonic`."""
+    has_changed: bool
+    """Whether it was another before, so that its holder lived then."""
+
+
+_sightings: dict[tuple[str, str], _Sighting] = {}
+
+
+def _sighted(bucket: Bucket, key: str, data: bytes) -> _Sighting:
+    where, now = (str(bucket.url), key), time.monotonic()
+    known = _sightings.get(where)
+    if known is None or known.data != data:
+        known = _sightings[where] = _Sighting(data, now, known is not None)
+    return known
+
+
+def is_leased(bucket: Bucket, key: str, watch_s: float = 2.5 * _BEAT_S, believed_s: float = 2.5 * _BEAT_S) -> bool:
+    """Whether a process holds the lock; for a holder elsewhere that may be gone, this takes some seconds, once.
 
     Args:
         bucket: The sweep's objects.
         key: The lock's object.
         watch_s: Seconds for which a holder elsewhere is watched. Only `LEASE_S` makes sure that it is gone, as its
-            requests may be slow; two signs of life and a half are enough to show whether it lives.
+            requests may be slow; two signs of life and a half are enough to show whether it lives. The time since
+            this process has seen the same before counts.
+        believed_s: Seconds after a sign of life in which a holder elsewhere is not watched for the next one.
 
     Raises:
         CannotRunError: The store cannot be read.
     """
     found = bucket.get(key)
     if found is None or not _holder(found):
+        _sightings.pop((str(bucket.url), key), None)
         return False
     state = _is_here(_holder(found))
     if state is not None:
         return state
-    deadline = time.monotonic() + watch_s
-    while time.monotonic() < deadline:
+    seen = _sighted(bucket, key, found.data)
+    if seen.has_changed and time.monotonic() - seen.since < believed_s:
+        return True
+    while time.monotonic() < seen.since + watch_s:
         time.sleep(0.5)
         now = bucket.get(key)
-        if now is None or now.data != found.data:
-            return now is not None and bool(_holder(now))
+        if now is None or not _holder(now):
+            return False
+        if now.data != found.data:
+            _sighted(bucket, key, now.data)
+            return True
     return False
 
 

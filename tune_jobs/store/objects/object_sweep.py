@@ -49,7 +49,9 @@ class ObjectSweep(Artifacts):
     def __init__(self, url: ObjectUrl) -> None:
         self.url = url
         super().__init__(Parts(url))
-        self._stop = Asked(lambda: self._bucket.get(_STOP) is not None)
+        bucket = self._bucket
+        # Not of this sweep, which would live on in a circle, and its folder with it.
+        self._stop = Asked(lambda: bucket.get(_STOP) is not None)
         self._driver_uploads: LogUploads | None = None
         self._is_made = False
         """Whether this process has made the sweep."""
@@ -219,7 +221,7 @@ class ObjectSweep(Artifacts):
             holding(self.url, beating.is_sure, is_new=beating.is_first),
         ):
             # It is taken for one that holds the other: nobody has.
-            if not beating.is_first and is_leased(self._bucket, _DRIVER_LOCK, watch_s=LEASE_S):
+            if not beating.is_first and is_leased(self._bucket, _DRIVER_LOCK, LEASE_S, believed_s=0.0):
                 raise CannotRunError(*self._still_driven)
             self._parts.is_locked = beating.is_ours
             try:

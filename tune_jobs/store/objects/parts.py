@@ -74,9 +74,9 @@ class Parts:
     # -- folders of this machine
 
     def own(self) -> Path:
-        """Return a folder of this process alone."""
+        """Return a folder of this process alone, which lives as long as this."""
         if self._own is None:
-            self._own = own_folder()
+            self._own = own_folder(self)
         return self._own
 
     def shared(self) -> Path:

@@ -1,7 +1,8 @@
 """Folders of this machine for a sweep whose files are elsewhere: what was fetched, what waits to be uploaded, logs.
 
 Nothing here is missed when it is gone. Each process has a folder of its own, which is removed when it ends, or by a
-later process if it was killed; logs and what users open are in a folder that the processes of this machine share.
+later process if it was killed, and in it one for each sweep that it opens, which is removed with what opened it. Logs
+and what users open are in a folder that the processes of this machine share.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import secrets
 import shutil
 import stat
 import tempfile
+import weakref
 from pathlib import Path
 
 from policies.errors import CannotRunError
@@ -51,14 +53,20 @@ def _own(pid: int) -> Path:
     return folder
 
 
-def own_folder() -> Path:
-    """Return a new empty folder that is removed when this process ends.
+def own_folder(owner: object | None = None) -> Path:
+    """Return a new empty folder that is removed when this process ends, or before, with its owner.
+
+    Args:
+        owner: What needs it; None: this process. A service opens a sweep with every look, for weeks.
 
     Raises:
         CannotRunError: It cannot be made.
     """
     folder = _own(os.getpid()) / secrets.token_hex(6)
     _make(folder)
+    if owner is not None:
+        # All are removed at the end of the process, and a fork leaves its parent's alone.
+        weakref.finalize(owner, _remove, folder, os.getpid()).atexit = False
     return folder
 
 
