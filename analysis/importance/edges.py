@@ -133,6 +133,8 @@ def _beyond(item: Searched, side: str) -> list[float]:
     values = [beyond, *(limit for limit in (0.0, 1.0) if min(beyond, end) < limit < max(beyond, end))]
     if item.is_whole:
         values = [round(value) for value in values]
+    if item.is_on_log_scale:
+        values = [value for value in values if value > 0]
     return [value for value in values if (value < end if side == "low" else value > end)]
 
 

@@ -174,9 +174,12 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         return observations, rewards, terminated, truncated, {}
 
     def _as_array(self, values: Any, what: str, shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return what a vectorised version returned as an array of this shape; one row may come as a column."""
+        """Return what a vectorised version returned as an array of this shape; one row may come as a column.
+
+        It is a copy, as an environment may write all its steps into the same array.
+        """
         try:
-            array = np.asarray(values)
+            array = np.array(values)
         except Exception:  # noqa: BLE001 (ragged lists, say)
             array = np.empty(0, dtype=object)
         if array.dtype.kind in "biuf" and (array.shape == shape or (len(shape) == 1 and array.size == shape[0])):

@@ -143,7 +143,10 @@ def clip_by_global_norm(gradients: Tensor, limit: Tensor, networks_per_member: i
         The norms before clipping, (M, 1).
     """
     norms: Tensor = torch.linalg.vector_norm(gradients.view(networks_per_member, -1, gradients.shape[1]), dim=2)
-    norms = torch.linalg.vector_norm(norms, dim=0).unsqueeze(1)
+    num_members = norms.shape[1]
+    # A single column is computed by other code, whose last bit may differ: a member would learn another thing alone.
+    norms = torch.linalg.vector_norm(norms.repeat(1, 2) if num_members == 1 else norms, dim=0)
+    norms = norms[:num_members].unsqueeze(1)
     # Without a limit the quotient is inf / inf.
     factors = torch.where(limit.isinf(), 1.0, (limit / torch.clamp(norms + 1e-6, min=limit)).clamp(max=1.0))
     gradients.mul_(factors.repeat(networks_per_member, 1))

@@ -25,8 +25,8 @@ _COUNTERS = (
 _WEIGHTS = "weights"
 _RETURNS = "return_statistics"
 _STATISTICS = (OBS_MEAN, OBS_VAR, OBS_COUNT)
-_MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"})
-"""The names of the moments of Adam and of RMSprop."""
+_MOMENTS = ({"exp_avg", "exp_avg_sq"}, {"square_avg", "momentum_buffer"}, {"square_avg"})
+"""The names of the moments of Adam, and of RMSprop with and without momentum."""
 _HINT = "Use another checkpoint of the trial; training cannot continue from this one."
 
 

@@ -205,6 +205,17 @@ def test_what_a_vectorised_version_returns_is_arrays(returned: tuple[Any, ...]) 
     assert (terminated.dtype, truncated.dtype) == (np.bool_, np.bool_)
 
 
+def test_a_vectorised_version_may_write_all_its_steps_into_the_same_arrays() -> None:
+    rows, rewards, ends = np.zeros((2, 3), np.float32), np.zeros(2), np.zeros(2, bool)
+    envs = CheckedEnvs(Vectorised(2, (rows, rewards, ends, ends, {})), "Mine-v0")
+    envs.reset()
+    step = envs.step([0, 0])
+    rows += 1
+    rewards += 1
+    ends[:] = True
+    assert not any(returned.any() for returned in step[:4])
+
+
 @pytest.mark.parametrize(
     ("returned", "told"),
     [

@@ -332,6 +332,17 @@ def test_nobody_is_handed_out_any_more_when_the_sweep_stops(tmp_path: Path) -> N
     assert driven.keeper.running == set()
 
 
+def test_who_leaves_for_a_stop_of_which_the_driver_has_not_heard_is_paused(tmp_path: Path) -> None:
+    """In an object store, answers are some seconds old: it would have ended for good, as if a scheduler had done it."""
+    driven = Driven(tmp_path, 6)
+    assert driven.tell(t0000=(300, "paused")) is False
+    assert driven.status(0) == ("paused", 0)
+    # Nobody gets its place.
+    assert driven.assigned() == [1]
+    driven.tell(t0001=(300, "paused"))
+    assert [driven.status(number)[0] for number in (1, 4)] == ["paused", "pending"]
+
+
 def test_a_member_that_another_process_took_waits_again_and_has_not_failed(tmp_path: Path) -> None:
     driven = Driven(tmp_path, 3, num_packs=1)
     driven.tell(t0000=(100, 1.0))

@@ -32,6 +32,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "optimizer": "rmsprop", "rmsprop_momentum": 0.5, "target_update_unit": "episode", "target_update_freq": 2,
         "epsilon_unit": "episode", "epsilon_decay": 50,
     },
+    "rmsprop, without momentum": {"optimizer": "rmsprop", "target_update_freq": 40},
     "no target network, no replay": {"target_network": False, "double_q": False, "replay": "none"},
 }  # fmt: skip
 ITERATIONS = 3

@@ -286,6 +286,16 @@ def test_the_norm_of_all_of_a_members_networks_is_clipped() -> None:
     assert float(norms[1]) > 2.0
 
 
+def test_a_member_is_clipped_alike_alone_and_beside_others() -> None:
+    rng = torch.Generator().manual_seed(0)
+    for _ in range(300):
+        together = torch.randn(4, NUM_WEIGHTS, generator=rng)
+        alone = together[[0, 2]].clone()
+        clip_by_global_norm(together, torch.tensor([[0.5], [0.5]]), 2)
+        clip_by_global_norm(alone, torch.tensor([[0.5]]), 2)
+        assert torch.equal(alone, together[[0, 2]])
+
+
 @pytest.mark.usefixtures("in_double")
 def test_what_is_no_number_stays_so_under_clipping_and_stays_where_it_is() -> None:
     gradients = torch.ones(2, NUM_WEIGHTS)

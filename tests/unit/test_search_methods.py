@@ -242,6 +242,29 @@ def test_a_proposal_whose_values_do_not_go_together_is_replaced(method: str) -> 
         propose_point(spec, records, 5, refuse)
 
 
+@each_method
+def test_a_random_point_that_no_plan_has_looked_at_goes_together_too(method: str) -> None:
+    """Four trials run at once: the first points that are asked for beyond the planned ones are random."""
+    spec = make_spec(method=method, startup=4, space={"lr": {"uniform": [0.001, 1.0]}})
+    records = [record(index, {"lr": 0.1}, 0.1) for index in range(3)]
+    drawn = draw_point(spec.space, 4, spec.seed)
+
+    def check(point: dict[str, float]) -> None:
+        if point == drawn:
+            raise SpecError("too large")
+
+    other = propose_point(spec, records, 4, check)
+    assert other != drawn
+    assert propose_point(spec, records, 4, check) == other
+    assert propose_point(spec, records, 4, lambda point: None) == drawn
+
+    def refuse(point: dict[str, float]) -> None:
+        raise SpecError("never")
+
+    with pytest.raises(SpecError, match="never"):
+        propose_point(spec, records, 4, refuse)
+
+
 def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     find_spec, real_import = importlib.util.find_spec, builtins.__import__
     monkeypatch.setattr(
@@ -273,3 +296,11 @@ def test_of_what_has_not_begun_a_model_is_told_nothing() -> None:
     assert known_points(spec, waiting) == []
     (known,) = known_points(spec, [record(0, point, 3.0, point_index=0), waiting[1]])
     assert (known.is_running, known.scores) == (True, (3.0,))
+
+
+def test_further_seeds_that_wait_do_not_hide_a_point_from_the_model() -> None:
+    """An interrupted race of the best points: they would be missing, and their scores are known."""
+    spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
+    further = record(1, point, status="pending", point_index=0).model_copy(update={"seed_index": 1})
+    (known,) = known_points(spec, [record(0, point, 3.0, point_index=0), further])
+    assert (known.is_running, known.scores) == (False, (3.0,))

@@ -200,6 +200,17 @@ def test_nan_weights_end_a_trial_as_failed(tmp_path: Path) -> None:
     assert [(r.iteration, r.evaluation_return) for r in trial.results][-2:] == [(4, 4.0), (5, None)]
 
 
+def test_training_that_finds_nan_as_soon_as_it_goes_on_ends_where_it_was(tmp_path: Path) -> None:
+    class Engine(FakeEngine):
+        def train_iteration(self) -> IterationStats:
+            raise NonFiniteWeightsError("The gradients of an update are NaN or infinite.", "Lower lr.")
+
+    Trial(tmp_path, checkpoints={"every_iterations": 1, "keep": 1}).run_to(5)
+    progress = Trial(tmp_path, engine=Engine()).run()
+    assert (progress.status, progress.num_iterations, progress.num_env_steps) == ("failed", 5, 500)
+    assert progress.training_return == 20.0
+
+
 def test_training_that_finds_nan_itself_ends_a_trial_as_failed(tmp_path: Path) -> None:
     class Engine(FakeEngine):
         def train_iteration(self) -> IterationStats:

@@ -176,7 +176,7 @@ class PackDriver:
     @property
     def _nobody_comes_back(self) -> bool:
         """Whether no trial will need a place again that has given its own away."""
-        return not self._outside or self._store.stop_requested()
+        return not self._outside or self._keeper.stop_requested()
 
     def died(self, pack_id: str, error: str) -> None:
         """Handle the death of a pack's process, or an error of no single member; the pack is started again."""
@@ -267,7 +267,7 @@ class PackDriver:
         self._failures.failed(trial_id)
         self._left(trial_id, for_good=not report.retried)
         self._keeper.failed(trial_id, report.error or "", retried=report.retried, reached=report.reached)
-        if not report.retried or self._store.stop_requested():
+        if not report.retried or self._keeper.stop_requested():
             self._leave(pack, trial_id)
         else:
             self._keeper.started(trial_id)
@@ -358,7 +358,7 @@ class PackDriver:
 
     def _fill(self, pack: PackState, num_members: int) -> None:
         """Assign more trials to a pack; a trial that has to run alone is assigned only to an empty pack."""
-        if self._store.stop_requested():
+        if self._keeper.stop_requested():
             return
         if self._arrived:
             self._make_room(pack)

@@ -160,7 +160,7 @@ class _Run:
             if spec.search.has_model:
                 self._chooser = PointChooser(spec, self._record, self.keeper.all_records, self.keeper.change)
             self._stage(searched, "")
-        if replicas and not (searched and self.store.stop_requested()):
+        if replicas and not (searched and self.keeper.stop_requested()):
             # They show what a setting gives when it is trained to the end: none of them is compared and ended.
             self._scheduler, self._chooser = TuneScheduler(EveryoneGoesOn()), None
             self._stage(replicas, "-of-replicas")
@@ -172,7 +172,7 @@ class _Run:
         if packed:
             self._packs(packed, f"packs{suffix}")
         # Packs first, then single trials, because a pack uses all its CPUs all the time.
-        if others and not (packed and self.store.stop_requested()):
+        if others and not (packed and self.keeper.stop_requested()):
             self._single_trials(others, f"run{suffix}")
 
     def _build_scheduler(self) -> TrialScheduler:
@@ -307,7 +307,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         if self._is_finished():
             return True
         if self._asked_at is None:
-            if not self._store.stop_requested():
+            if not self._keeper.stop_requested():
                 return False
             self._asked_at = time.monotonic()
         return not self._keeper.running or time.monotonic() - self._asked_at > STOP_GRACE_S

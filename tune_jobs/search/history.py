@@ -69,7 +69,9 @@ def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownP
                 point=members[0].point,
                 scores=tuple(map(_score, ended)),
                 env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps) for record in ended),
-                is_running=len(ended) < len(members),
+                is_running=any(
+                    record.status not in FINISHED for record in members if record.seed_index < spec.seeds_per_point
+                ),
                 level=_level(spec, members),
             )
         )

@@ -20,20 +20,26 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from analysis.records import PriorRecord, TrialRecord
-from policies.errors import CannotRunError
+from policies import random_streams
+from policies.errors import CannotRunError, SpecError
 from tune_jobs.search.asking import Check, Method, Question
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.parts import Parts
 from tune_jobs.search.prior import with_prior
 from tune_jobs.search.two_objectives import weighed
+from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.sweep_spec import SweepSpec
+
+_NUM_DRAWN = 1_000
+"""Random points of which one has values that go together, or the search ends."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,7 @@ def propose_point(
     Where the sweep asks for score and cost, the methods are told of both (`two_objectives`).
 
     The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, the point
-    is the random one of its index.
+    is the random one of its index, or another random one where its values contradict each other.
 
     Args:
         spec: The sweep.
@@ -131,8 +137,8 @@ def next_point(
         index: The index of the point, from 0: its random numbers belong to it.
         seed: At least 0; the same seed, index and known points give the same point.
         num_startup_trials: How many points have to end before a model proposes points; until then they are random.
-        check: Raises SpecError for a point whose values contradict each other; then another is proposed, except of
-            random points.
+        check: Raises SpecError for a point whose values contradict each other; then another is proposed, except by
+            `random`, whose points are all known and checked before.
 
     Raises:
         SpecError: None of many proposals is valid.
@@ -141,8 +147,10 @@ def next_point(
     """
     check_installed(method)
     is_too_early = sum(not point.is_running for point in known) < num_startup_trials
-    if method == "random" or is_too_early:
+    if method == "random":
         return draw_point(space, index, seed)
+    if is_too_early:
+        return _valid_draw(space, index, seed, check)
     propose, parts = _METHODS[method].load(), Parts(space)
     if parts.are_the_same:
         return propose(Question(space, known, index, seed), check)
@@ -150,3 +158,21 @@ def next_point(
     return parts.point_of(
         propose(Question(parts.space, seen, index, seed, parts), lambda values: check(parts.point_of(values)))
     )
+
+
+def _valid_draw(space: Mapping[str, Domain], index: int, seed: int, check: Check) -> dict[str, Any]:
+    """Return the random point of an index, or the next of its stream whose values go together.
+
+    Of those that are asked for while the first ones still run, no plan has looked at any.
+    """
+    point, rng = draw_point(space, index, seed), random_streams.model_draws(seed, index)
+    for number in itertools.count(1):
+        try:
+            check(point)
+        except SpecError:
+            if number == _NUM_DRAWN:
+                raise
+            point = Conditions(space).stripped({name: domain.sample(rng) for name, domain in space.items()})
+        else:
+            break
+    return point

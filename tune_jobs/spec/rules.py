@@ -30,6 +30,8 @@ FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
         "vf_share_layers", "free_log_std", "dueling", "target_network",
         # The optimizer's state would differ from the one that is copied.
         "optimizer", "rmsprop_momentum",
+        # The last target update is counted in it.
+        "target_update_unit",
         # There would be other sub-environments, by which a trial's seeds are counted.
         "num_envs",
         # They act only at a trial's start.

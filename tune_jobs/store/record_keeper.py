@@ -60,6 +60,8 @@ class RecordKeeper:
         self._num_writes_due, self._flushed_at = _WRITES_PER_S, clock()
         self.running: set[str] = set()
         """The trials that a process runs."""
+        self._has_left_one = False
+        """Whether a trial has saved and left because somebody asked for the end."""
 
     def __getstate__(self) -> dict[str, Any]:
         # Tune pickles this object into a file that is never read back; listeners and open files can't be pickled.
@@ -96,6 +98,8 @@ class RecordKeeper:
         """Take a trial's progress."""
         if progress.status != "running":
             self.running.discard(trial_id)
+        if progress.status == "paused":
+            self._has_left_one = True
         record = transitions.told(self._records[trial_id], progress, node=node, pid=pid)
         self._update(trial_id, record)
         self._scalars.write(record, progress.iterations)
@@ -127,10 +131,18 @@ class RecordKeeper:
         record = self._records[trial_id]
         if record.status not in ("running", "paused"):
             return
-        if self._store.stop_requested():
+        if self.stop_requested():
             self._update(trial_id, transitions.paused(record))
         else:
             self._update(trial_id, transitions.stopped(record, time.time()))
+
+    def stop_requested(self) -> bool:
+        """Whether somebody has asked for the end of the run, as far as this process or one that trains knows.
+
+        What the store answers may be some seconds old, and another process may have heard a newer answer: trials that
+        leave for that are not to be taken for ended by a scheduler, and nobody gets their places.
+        """
+        return self._has_left_one or self._store.stop_requested()
 
     def failed(self, trial_id: str, error: str, *, retried: bool, reached: Reached | None = None) -> None:
         """Note that a trial failed, finally or to be retried.

@@ -152,6 +152,7 @@ class TrialSteps:
         elif latest is not None:
             folder = self._store.checkpoint_folder(latest.iteration)
         self._take_up_results(start)
+        self._taken = self._last
         self._built_from = folder
 
     def build(self) -> None:
