@@ -1,6 +1,7 @@
 """What Ray Tune is told of a trial that another process has, or whose paused checkpoint is damaged."""
 
 import json
+import pickle
 import types
 from pathlib import Path
 
@@ -80,6 +81,24 @@ def test_a_pause_at_a_checkpoint_that_was_set_aside_is_gone_on_from(
         # Gone for no known reason: it must not begin anew in silence.
         with pytest.raises(CheckpointError, match="was paused at iteration 6"):
             trainable.load_checkpoint(str(tmp_path))
+
+
+def test_a_pause_goes_from_node_to_node_without_a_folder_of_tunes(tmp_path: Path) -> None:
+    """Tune's is one of the driver's machine, where the sweep is in an object store."""
+    store = make_sweep(tmp_path / "mine", 1)
+    here, there = TrialTrainable.__new__(TrialTrainable), TrialTrainable.__new__(TrialTrainable)
+    for trainable in (here, there):
+        trainable._trial, trainable._refusal, trainable._loop = (store.place, "t0000"), None, None
+        trainable._local_ip = "127.0.0.1"
+    # It has no method: nothing is carried by it.
+    here._storage, here._last_result = object(), {"training_iteration": 4}
+    saved = here.save()
+    assert saved.checkpoint
+    there.restore(pickle.loads(pickle.dumps(saved)))
+    assert there.iteration == 4
+    saved.metrics["pointer.json"] = json.dumps({"trial_id": "t0000", "iteration": 6})
+    with pytest.raises(CheckpointError, match="was paused at iteration 6"):
+        there.restore(saved)
 
 
 def test_a_run_that_can_write_no_more_says_how_to_go_on() -> None:

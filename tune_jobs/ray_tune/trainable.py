@@ -12,6 +12,7 @@ import json
 import os
 import socket
 import sys
+import tempfile
 import traceback
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import IO, Any
 
 import ray
 from ray import tune
+from ray.train._internal.checkpoint_manager import _TrainingResult
 
 from policies.acting.evaluate import Evaluator
 from policies.envs.faults import note_signals
@@ -46,6 +48,7 @@ from tune_jobs.training.trial_loop import TrialLoop
 # Reporting every iteration of a fast env would take longer than the iteration.
 REPORT_INTERVAL_S = 1.0
 _POINTER = "pointer.json"
+_NO_FOLDER = "/no-folder-of-checkpoints-of-tune"
 _LONGEST_WATCH_S = 1e9
 """Thirty years, in seconds; the fault handler's clock overflows at 300 years."""
 
@@ -273,6 +276,29 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             "node": self._node,
             "host": socket.gethostname(),
         }
+
+    def save(self, checkpoint_dir: str | None = None) -> _TrainingResult:
+        """Save when Tune pauses the trial, and return its pointer to the checkpoint.
+
+        Tune (2.60) would carry it through files in the folder of its run, which is one of the driver's machine: another
+        node has none where the sweep is in an object store. So it is carried in the result itself.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            self.save_checkpoint(folder)
+            pointer = (Path(folder) / _POINTER).read_text(encoding="utf-8")
+        metrics = {**(self._last_result or {}), _POINTER: pointer}
+        # A checkpoint that is none would be taken for a save that failed.
+        return _TrainingResult(tune.Checkpoint.from_directory(checkpoint_dir or _NO_FOLDER), metrics)
+
+    def restore(self, checkpoint_path: _TrainingResult) -> None:
+        """Be given what `save` returned, of this trial or of another one.
+
+        Raises:
+            CheckpointError: The checkpoint of the pause is not there.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / _POINTER).write_text(checkpoint_path.metrics[_POINTER], encoding="utf-8")
+            super().restore(_TrainingResult(tune.Checkpoint.from_directory(folder), checkpoint_path.metrics))
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
         """Save when Tune pauses the trial: the checkpoint goes to the sweep folder, and Tune gets a pointer to it."""
