@@ -5,12 +5,13 @@ from typing import Any
 import pytest
 
 from analysis.answers import replicas_text
+from analysis.objectives import SettingScores
 from analysis.racing import Race, race_within
 from analysis.records import ReplicationRecord, SweepRecord, TrialRecord
 from policies.errors import SpecError
 from tune_jobs.spec.file import json_schema, stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
-from tune_jobs.sweeps.confirm import confirming_race, may_confirm, recent_rounds, trials_before
+from tune_jobs.sweeps.confirm import confirming_race, different_points, may_confirm, recent_rounds, trials_before
 
 CAP = 1_000
 
@@ -80,6 +81,14 @@ def test_the_largest_race_never_takes_more_trainings_than_allowed(allowed: int) 
 def test_one_setting_has_nothing_to_race_with() -> None:
     assert race_within([3], top=5, num_seeds=5, max_trainings=100) is None
     assert race_within([], top=5, num_seeds=5, max_trainings=100) is None
+
+
+def test_equal_points_race_once() -> None:
+    def setting(index: int, lr: float) -> SettingScores:
+        return SettingScores(index, {"lr": lr}, (1.0,), (f"t{index:04d}",), 0, 1.0, (CAP,))
+
+    found = different_points([setting(3, 0.1), setting(0, 0.2), setting(5, 0.1), setting(1, 0.3), setting(2, 0.2)])
+    assert found == [3, 0, 1]
 
 
 # -- the share

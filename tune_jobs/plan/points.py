@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,10 +10,12 @@ from pydantic import ValidationError
 
 from analysis.numbering import first_index
 from analysis.records import TRAINING_LENGTH, ChosenPointRecord, ReplicationRecord
+from analysis.wording import counted
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, PPOHyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.plan.estimates import iteration_env_steps
+from tune_jobs.spec.domains import Listed
 from tune_jobs.spec.draws import num_points
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -28,6 +31,24 @@ def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = 
     """Return the number of a sweep's points, those among them that somebody chose."""
     drawn = spec.num_samples if spec.search.has_model else num_points(spec.space, spec.num_samples)
     return drawn + len(chosen_points)
+
+
+def repeated_points_notes(spec: SweepSpec) -> list[str]:
+    """Return a note if points of a sweep must be the same as others, which then count as settings of their own."""
+    if (
+        spec.search.type == "random"
+        and spec.num_samples > 1
+        and not any(domain.is_random for domain in spec.space.values())
+    ):
+        repeats = f"The space has no random domain, so num_samples {spec.num_samples} repeats every point"
+        return [f"{repeats}; seeds_per_point does that and averages over the seeds."]
+    listed = [domain for domain in spec.space.values() if isinstance(domain, Listed)]
+    num_different, num_tried = math.prod(len(domain.values) for domain in listed), num_points_of(spec)
+    if len(listed) < len(spec.space) or num_different >= num_tried or spec.scheduler.is_population:
+        return []
+    different = counted(num_different, "different point")
+    repeats = f"The space has {different}, so some of the {num_tried} that num_samples gives are the same"
+    return [f"{repeats}; seeds_per_point trains each again, and averages over the seeds."]
 
 
 def num_trials_of(

@@ -33,7 +33,14 @@ from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.memory import lowered_by_memory
 from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
-from tune_jobs.plan.points import num_points_of, num_trials_of, place_of_point, point_hyperparams, trial_id
+from tune_jobs.plan.points import (
+    num_points_of,
+    num_trials_of,
+    place_of_point,
+    point_hyperparams,
+    repeated_points_notes,
+    trial_id,
+)
 from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.chosen_point import outside_notes
 from tune_jobs.search.given_points import given_points
@@ -353,16 +360,7 @@ def _largest(
 
 def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
     """Return notes on the sweep; `concurrent` is how many trials run at once, or None if packs need no such note."""
-    notes = []
-    if (
-        spec.search.type == "random"
-        and spec.num_samples > 1
-        and not any(domain.is_random for domain in spec.space.values())
-    ):
-        notes.append(
-            f"The space has no random domain, so num_samples {spec.num_samples} repeats every point; "
-            "seeds_per_point does that and averages over the seeds."
-        )
+    notes = repeated_points_notes(spec)
     seen = seen_by_networks(env.observation_space)
     if isinstance(seen, FlatBox):
         kind = "images of shape" if env.observes_images else "vectors of shape"

@@ -7,8 +7,9 @@ race, and an equal spec and seed give an equal one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from analysis.objectives import reached_goal
+from analysis.objectives import SettingScores, reached_goal
 from analysis.racing import Race, race_within
 from analysis.records import ReplicationRecord, SweepRecord, TrialRecord
 from policies.portable.file import BASELINE_KINDS
@@ -44,12 +45,22 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
     with store.reading():
         trials, results = read_trials(store), read_results(store)
     before = trials_before(trials, rounds)
-    contenders = [item.point_index for item in ranked(spec, before, results, threshold)]
-    race = confirming_race(spec, contenders, before)
+    race = confirming_race(spec, different_points(ranked(spec, before, results, threshold)), before)
     if race is None:
         return ()
     scores = {item.point_index: item.scores for item in ranked(spec, trials, results, threshold)}
     return race.next_points(scores, len(rounds))
+
+
+def different_points(settings: Sequence[SettingScores]) -> list[int]:
+    """Return the points of settings in their order, of equal values only the first: no setting races with itself."""
+    seen: list[dict[str, Any]] = []
+    points = []
+    for item in settings:
+        if item.point not in seen:
+            seen.append(item.point)
+            points.append(item.point_index)
+    return points
 
 
 def recent_rounds(record: SweepRecord) -> list[ReplicationRecord]:
