@@ -13,6 +13,7 @@ from sqlalchemy.exc import OperationalError
 from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError, NotFoundError, TuneJobsError
+from tests.narrowing import present
 from tune_jobs.client import Client, Event, NoServiceError, event_stream
 from tune_jobs.client import client as client_module
 from tune_jobs.client.event_stream import Parser
@@ -224,7 +225,7 @@ def test_a_database_that_is_away_for_a_moment_is_no_end(live: Live, monkeypatch:
         back = threading.Timer(1.0, away.clear)
         back.start()
         queue.request_stop("mine")
-        assert client.wait("mine", job=job, timeout_s=20).job.outcome == "cancelled"
+        assert present(client.wait("mine", job=job, timeout_s=20).job).outcome == "cancelled"
         assert "job" in looked
         back.join()
         away.set()

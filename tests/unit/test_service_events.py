@@ -12,7 +12,6 @@ from typing import Any
 import httpx2
 import pytest
 from live_service import EventReader, Live, live, serving, wait_until  # noqa: F401 (a fixture)
-from sqlalchemy.exc import OperationalError
 from sweep_folders import make_sweep_folder
 
 from analysis.records import IterationRecord
@@ -140,31 +139,6 @@ def test_jobs_and_labels_come(live: Live, store: SweepStore) -> None:
         assert reader.of("status")[-1].data["job"]["state"] == "waiting"
         live.service.queue.request_stop("mine")
         reader.wait_for(lambda: reader.of("job")[-1].data["outcome"] == "cancelled")
-
-
-def test_after_looks_that_failed_all_is_asked_for_anew(
-    live: Live, store: SweepStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Such a look has read changes that it told nobody of."""
-    monkeypatch.setattr(watching, "_MOST_WAIT_S", 0.2)
-    with live.events("/sweeps/mine/events") as reader:
-        reader.wait_for(lambda: reader.of("status"))
-        real, failed = live.service.queue.jobs, threading.Event()
-
-        def jobs(*states: Any, sweep: str | None = None) -> Any:
-            if sweep is not None:
-                failed.set()
-                raise OperationalError(None, None, Exception("it is being started again"))
-            return real(*states)
-
-        monkeypatch.setattr(live.service.queue, "jobs", jobs)
-        store.trial("t0000").append_iterations([iteration(7)])
-        wait_until(failed.is_set)
-        monkeypatch.setattr(live.service.queue, "jobs", real)
-        reader.wait_for(lambda: reader.of("reset"))
-        store.trial("t0000").append_iterations([iteration(8)])
-        reader.wait_for(lambda: rows_of(reader)[-1:] == [8])
-        assert len(reader.of("reset")) == 1
 
 
 def test_a_trial_that_goes_back_to_its_checkpoint_says_so(live: Live, store: SweepStore) -> None:

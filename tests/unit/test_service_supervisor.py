@@ -269,22 +269,6 @@ def test_with_the_database_lost_sweeps_are_found_by_their_folders(place: Place) 
     assert len(others) == 1
 
 
-def test_a_start_begins_nothing_again_that_somebody_stopped_or_that_failed(place: Place) -> None:
-    for name, state in (("waits", "created"), ("killed", "running"), ("dies", "running"), ("anew", "created")):
-        place.add(name, state=state)
-        job = place.queue.begin(name, "drive", {}, owner="ann", num_cpus=1.0)[0]
-        if name == "waits":
-            place.queue.request_stop(name)
-        elif name == "anew":
-            # The job of one of the same name, long before.
-            place.queue.end(job.id, "stopped", at=1.0)
-        else:
-            place.queue.end(job.id, "stopped" if name == "killed" else "failed")
-    for _ in range(2):
-        place.new_service().reconcile()
-        assert [job.sweep for job in place.queue.jobs("waiting")] == ["anew"]
-
-
 def test_a_job_whose_sweep_was_never_written_is_forgotten(place: Place) -> None:
     place.queue.begin("never", "drive", {}, owner="ann", key=("k", "d"), state="creating")
     place.add("written")

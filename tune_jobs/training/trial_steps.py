@@ -152,8 +152,7 @@ class TrialSteps:
         elif latest is not None:
             folder = self._store.checkpoint_folder(latest.iteration)
         self._take_up_results(start)
-        self._taken = self._last
-        self._built_from = folder
+        self._taken, self._built_from = self._last, folder
 
     def build(self) -> None:
         """Do the second half of `open`: build the trial from what was read.
