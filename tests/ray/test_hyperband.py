@@ -1,13 +1,15 @@
 """HyperBand decides as Ray Tune's does wherever that comes to an end, and no trial waits for ever."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 from former_schedulers import former_hyperband
-from hyperband_sweeps import decided
+from hyperband_sweeps import Controller, FakedTrial, decided
+from ray.tune.experiment import Trial
 
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
-from tune_jobs.ray_tune.hyperband import HyperBand
+from tune_jobs.ray_tune.hyperband import HyperBand, HyperBandScheduler
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
 
 pytestmark = pytest.mark.ray
@@ -73,3 +75,39 @@ def test_a_trial_without_a_score_is_ended_and_one_without_an_evaluation_goes_on(
     assert rule.reached(Standing("t0000", 700, 1.0, evaluated=False), NobodyWaits()) is Decision.GO_ON
     assert reach(rule, 0, 100, WORST_SCORE) is Decision.STOP
     assert reach(rule, 0, 100, float("nan")) is Decision.STOP
+
+
+def test_a_trial_that_is_tried_again_stays_in_its_bracket_as_in_packs() -> None:
+    """Tune tells of each retry as of an error and of a new trial."""
+    scheduler = HyperBandScheduler(made(0))
+    trials = [FakedTrial(number) for number in range(8)]
+    controller: Any = Controller(trials, scheduler, 100)
+
+    def report(trial: Any, steps: int, score: float) -> str:
+        trial.status, trial.num_env_steps = Trial.RUNNING, steps
+        result = {"num_env_steps": steps, "score": score, "evaluated": True}
+        return str(scheduler.on_trial_result(controller, trial, result))
+
+    for trial in trials:
+        scheduler.on_trial_add(controller, trial)
+    for number, trial in enumerate(trials[:7]):
+        assert report(trial, 100, number) == "PAUSE"
+        trial.status = Trial.PAUSED
+    last: Any = trials[7]
+    last.status = Trial.ERROR
+    scheduler.on_trial_error(controller, last)
+    last.status = Trial.PENDING
+    scheduler.on_trial_add(controller, last)
+    assert controller.take_stopped() == []
+    # The worst of all, when it comes there.
+    assert report(last, 100, -1.0) == "STOP"
+    assert sorted(controller.take_stopped()) == ["t0000", "t0001", "t0002"]
+    # One that fails for good is waited for no longer.
+    assert report(trials[3], 200, 3) == "PAUSE"
+    trials[3].status = Trial.PAUSED
+    for number in (4, 5):
+        assert report(trials[number], 200, number) == "PAUSE"
+        trials[number].status = Trial.PAUSED
+    trials[6].status = Trial.RUNNING
+    scheduler.on_trial_error(controller, trials[6])
+    assert controller.take_stopped() == ["t0003"]

@@ -49,6 +49,20 @@ def test_a_trial_that_another_process_has_is_not_counted_as_failed(tmp_path: Pat
     assert keeper.record("t0001").num_failures == 1
 
 
+@pytest.mark.parametrize("is_stopped", [False, True])
+def test_a_scheduler_may_end_a_trial_that_was_to_be_tried_again(tmp_path: Path, is_stopped: bool) -> None:
+    store = make_sweep(tmp_path / "mine", 1)
+    keeper = RecordKeeper(store, ["t0000"], lambda record: None)
+    losses = NodeLosses(lambda trial: 0, lambda error: None)
+    events = TrialEvents(store, keeper, 600.0, RayWatch({}, grace_s=1.0), losses)
+    keeper.started("t0000")
+    keeper.failed("t0000", "it broke", retried=True)
+    if is_stopped:
+        store.request_stop()
+    events.on_trial_complete(0, [], tune_trial("t0000"))
+    assert keeper.record("t0000").status == ("pending" if is_stopped else "stopped")
+
+
 def test_a_driver_of_a_run_that_is_over_touches_nothing(tmp_path: Path) -> None:
     store = make_sweep(tmp_path / "mine", 1)
     run = store.take()

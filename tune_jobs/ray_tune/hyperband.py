@@ -197,7 +197,10 @@ class HyperBandScheduler(TuneScheduler):
 
     @override
     def on_trial_error(self, tune_controller: TuneController, trial: Trial) -> None:
-        self.on_trial_remove(tune_controller, trial)
+        # One with this status goes on: Tune (2.60) calls this for each retry, too. It stays in its bracket, whose other
+        # trials wait for it. That of one that has failed for good follows later.
+        if trial.status != Trial.ERROR:
+            self.on_trial_remove(tune_controller, trial)
 
     @override
     def on_trial_remove(self, tune_controller: TuneController, trial: Trial) -> None:

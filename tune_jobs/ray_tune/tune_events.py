@@ -73,7 +73,11 @@ class TrialEvents(tune.Callback):  # type: ignore[misc]
 
     def on_trial_complete(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Note a trial's end: its own, the scheduler's decision, or the end of the run."""
-        self._keeper.ended(trial_id_of(trial))
+        trial_id = trial_id_of(trial)
+        if self._keeper.record(trial_id).status == "pending" and not self._keeper.stop_requested():
+            # The scheduler ends one that was to be tried again.
+            self._keeper.started(trial_id)
+        self._keeper.ended(trial_id)
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: Any) -> None:
         """Note a failure that will be retried."""

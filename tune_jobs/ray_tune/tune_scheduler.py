@@ -35,10 +35,14 @@ class TuneScheduler(FIFOScheduler):  # type: ignore[misc]
     def __init__(self, scheduler: Scheduler) -> None:
         super().__init__()
         self.scheduler = scheduler
+        self._begun: set[str] = set()
 
     @override
     def on_trial_add(self, tune_controller: TuneController, trial: Trial) -> None:
-        self.scheduler.begins(name_of(trial))
+        # Tune (2.60) adds a trial again with each retry.
+        if (name := name_of(trial)) not in self._begun:
+            self._begun.add(name)
+            self.scheduler.begins(name)
 
     @override
     def choose_trial_to_run(self, tune_controller: TuneController) -> Trial | None:
