@@ -62,7 +62,9 @@ def rank_settings(
     num_env_steps: int,
     threshold: float | None = None,
 ) -> list[SettingScores]:
-    """Return the settings of a sweep, the one with the best expected mean first; of equal ones, the lower index.
+    """Return the settings of a sweep, the one with the best expected mean first.
+
+    Of equal ones, first come those with fewer trials that failed or have no score, then those of lower index.
 
     Trials that have not ended are left out, and so are settings that have no others. A trial that failed, or ended
     without any whole episode, counts as the worst of all: to leave it out would raise the mean of its setting.
@@ -106,7 +108,13 @@ def rank_settings(
         )
         for (index, seeds), value in zip(members.items(), expected, strict=True)
     ]
-    return sorted(settings, key=lambda item: (-item.expected, -item.mean, item.point_index))
+
+    def order(item: SettingScores) -> tuple[float, float, int, int]:
+        # Where the worst score is the best too, who has it for a failure comes behind who has earned it.
+        num_unscored = sum(trial_id not in known for trial_id in item.trial_ids)
+        return -item.expected, -item.mean, num_unscored, item.point_index
+
+    return sorted(settings, key=order)
 
 
 def reached_goal(trial: TrialRecord) -> bool:

@@ -86,9 +86,10 @@ def _of_settings(source: Source, settings: SettingsRecord) -> list[str]:
 
 
 def _all_equal(settings: SettingsRecord) -> bool:
-    """Whether all seeds of all settings have the same score; where not all settings are listed, that isn't known."""
+    """Whether all seeds of all settings have reached one score; where not all settings are listed, it is not known."""
     scores = {score for item in settings.ranking for score in item.scores}
-    return settings.num_settings == len(settings.ranking) and len(scores) == 1
+    has_failures = any(item.num_failed for item in settings.ranking)
+    return settings.num_settings == len(settings.ranking) and len(scores) == 1 and not has_failures
 
 
 def _one_seed(source: Source, settings: SettingsRecord) -> list[str]:

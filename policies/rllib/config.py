@@ -64,6 +64,9 @@ def build_algorithm_config(
             env_runner_cls=ArrayEnvRunner,
             num_env_runners=num_env_runners,
             num_envs_per_env_runner=hyperparams.num_envs,
+            # RLlib drops what an env runner samples for longer than a minute, and goes on without it. How long an
+            # iteration may take is watched from outside.
+            sample_timeout_s=None,
         )
         .learners(num_learners=0, num_gpus_per_learner=num_gpus)
         .rl_module(rl_module_spec=module_spec(hyperparams, rl_module))

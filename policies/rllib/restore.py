@@ -105,6 +105,13 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     except TuneJobsError as error:
         algorithm.stop()
         raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
+    if algorithm.config.sample_timeout_s is not None:
+        # Written before samples had no limit.
+        config = algorithm.config.copy(copy_frozen=False)
+        config.env_runners(sample_timeout_s=None)
+        config.freeze()
+        algorithm.config = config
+    _send_weights(algorithm)
     return algorithm
 
 
@@ -131,12 +138,31 @@ def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: Poli
         for group, own in zip(_optimizer_groups(algorithm), settings, strict=True):
             group.update(own)
         check_weights(algorithm, expected)
+        _send_weights(algorithm)
     except TuneJobsError as error:
         algorithm.stop()
         raise CheckpointError(f"{rllib_checkpoint}: {error.message}", _RESTORE_HINT) from error
     except Exception as error:
         algorithm.stop()
         raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
+
+
+def _send_weights(algorithm: Algorithm) -> None:
+    """Send the learner's weights to env runners in other processes, once more.
+
+    RLlib (2.60) sends a new Algorithm's weights and those of a restore one after the other, and drops the second where
+    the first have not arrived: the runner would sample with an untrained policy.
+    """
+    group = algorithm.env_runner_group
+    if not group.num_remote_env_runners():
+        return
+    # Calls are done in their order: what was sent before has arrived when this one is answered.
+    group.foreach_env_runner(_nothing, local_env_runner=False)
+    group.sync_weights(from_worker_or_learner_group=algorithm.learner_group, inference_only=True)
+
+
+def _nothing(_: Any) -> None:
+    """Be answered."""
 
 
 def _optimizer_groups(algorithm: Algorithm) -> list[dict[str, Any]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -183,6 +185,36 @@ def test_dqn_with_env_runners_sends_them_its_weights(engine: RLlibEngine, tmp_pa
     engine.train_iteration()
     engine.train_iteration()
     algorithm = engine.algorithm
+    (theirs,) = algorithm.env_runner_group.foreach_env_runner(
+        lambda runner: runner.module.get_state(), local_env_runner=False
+    )
+    ours = algorithm.learner_group.get_weights()["default_policy"]
+    assert same(theirs, {name: ours[name] for name in theirs})
+
+
+@pytest.mark.parametrize("changes", [{}, {"lr": 0.002}])
+def test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_arrived(
+    engine: RLlibEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float]
+) -> None:
+    """They would sample with an untrained policy. By another setting, it is a copy for a population."""
+    from ray import cloudpickle
+
+    from tune_jobs.training import rllib
+    from tune_jobs.training.env_runner import EnvRunner
+
+    class Slow(EnvRunner):
+        def set_state(self, state: Any) -> None:
+            time.sleep(0.4)
+            super().set_state(state)
+
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    monkeypatch.setattr(rllib, "EnvRunner", Slow)
+    engine.build(make_task(tmp_path, "ppo", num_env_runners=1), None)
+    engine.train_iteration()
+    folder = save(engine, tmp_path / "000001")
+    engine.build(make_task(tmp_path, "ppo", num_env_runners=1, **changes), folder)
+    algorithm = engine.algorithm
+    assert algorithm.config.sample_timeout_s is None
     (theirs,) = algorithm.env_runner_group.foreach_env_runner(
         lambda runner: runner.module.get_state(), local_env_runner=False
     )

@@ -317,6 +317,20 @@ def test_a_study_of_every_kind_of_domain_may_be_kept_in_a_file(tmp_path: Path) -
         tune_jobs.export("mine", "optuna", output=paths["study"], storage=tmp_path)
 
 
+def test_a_study_that_could_not_be_written_whole_is_not_left(
+    data: SweepData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("optuna")
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tune_jobs.search.study._as_optunas", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make_study(spec_of(), data, "mine", tmp_path / "study.db")
+    assert not (tmp_path / "study.db").exists()
+
+
 def test_numbers_that_are_none_are_left_out_of_a_study() -> None:
     optuna = pytest.importorskip("optuna")
     shown = [trial(0, {"lr": 0.001}, time_s=math.nan, training_return=math.inf), trial(1, {"lr": 0.002})]

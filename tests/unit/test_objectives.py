@@ -166,6 +166,12 @@ def test_a_failed_seed_counts_as_the_worst_of_the_sweep() -> None:
     assert second.num_failed == 1
 
 
+def test_who_has_the_worst_score_for_a_failure_comes_behind_who_has_earned_it() -> None:
+    # The worst score that is known is the best one, too.
+    assert [item.point_index for item in ranked([[None], [None], [480], [None]])] == [2, 0, 1, 3]
+    assert [item.point_index for item in ranked([[None, 500], [500, 500]])] == [1, 0]
+
+
 def test_trials_that_have_not_ended_are_left_out() -> None:
     trials, results = made([[1], [5], [3]])
     trials[1] = trials[1].model_copy(update={"status": "running"})
@@ -215,6 +221,12 @@ def test_the_better_half_goes_on_with_twice_as_many_seeds() -> None:
     assert race.next_points({index: seeds[:1] for index, seeds in scores.items()}, 0) == (4, 7, 1, 0)
     assert race.next_points(scores, 1) == (7, 0, 7, 0)
     assert race.next_points(scores, 2) == ()
+
+
+def test_of_scores_beyond_all_squares_nobody_is_out() -> None:
+    race = Race((0, 1, 2), 3)
+    scores = {0: [-100.0, -1e200], 1: [-200.0, -150.0], 2: [-300.0, -100.0]}
+    assert len(race.next_points(scores, 1)) > 0
 
 
 def test_a_race_ends_when_only_one_can_still_win() -> None:

@@ -58,10 +58,11 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
         )
     import optuna
 
+    storage = _storage(path)
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
-        study = optuna.create_study(study_name=name, direction="maximize", storage=_storage(path))
+        study = optuna.create_study(study_name=name, direction="maximize", storage=storage)
         trials = [trial for trial in data.trials if trial.status in FINISHED and trial.has_point]
         parts = Parts(spec.space)
         points = [parts.known_values_of(trial.point) for trial in trials]
@@ -72,6 +73,11 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
         study.set_user_attr("objective", data.objective)
         for trial in sorted(trials, key=lambda item: item.index):
             study.add_trial(_as_optunas(spec, data, trial, distributions))
+    except BaseException:
+        # A part of it would be taken for the whole by whoever opens it.
+        if path is not None:
+            path.unlink(missing_ok=True)
+        raise
     finally:
         optuna.logging.set_verbosity(verbosity)
     return study
