@@ -6,6 +6,7 @@ before is still there if it is the same file, and the line that was read last st
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -19,9 +20,6 @@ from policies.errors import CheckpointError
 from policies.files import open_regular
 from tune_jobs.store.places import stamp_of
 from tune_jobs.store.results_file import MAX_BYTES, agreeing
-
-_MAX_REMEMBERED = 64
-"""Bytes of the line that was read last, by which it is known again; its beginning has the numbers that rise."""
 
 
 class CurvePoint(BaseModel):
@@ -51,7 +49,7 @@ class ResultsMark:
     line_begin: int = 0
     """Where the last of them begins."""
     line: bytes = b""
-    """Its first bytes."""
+    """A hash of it, by which it is known again."""
     iteration: int = -1
     num_env_steps: int = 0
 
@@ -108,7 +106,11 @@ def _is_there(file: BufferedReader, stamp: tuple[int, ...], since: ResultsMark) 
         return False
     # The number of a file that is gone is given to another one.
     file.seek(since.line_begin)
-    return file.read(len(since.line)) == since.line
+    return _hash(file.read(since.offset - since.line_begin)) == since.line
+
+
+def _hash(line: bytes) -> bytes:
+    return hashlib.blake2b(line, digest_size=16).digest()
 
 
 def _lines(data: bytes) -> list[bytes]:
@@ -141,7 +143,7 @@ def _mark(stamp: tuple[int, ...], since: ResultsMark, data: bytes, points: Seque
     if not end:
         return replace(since, stamp=stamp)
     line_begin = data.rfind(b"\n", 0, end - 1) + 1
-    line = data[line_begin : min(end, line_begin + _MAX_REMEMBERED)]
+    line = _hash(data[line_begin:end])
     last = points[-1] if points else since
     begin = since.offset
     return ResultsMark(stamp, begin + end, begin + line_begin, line, last.iteration, last.num_env_steps)

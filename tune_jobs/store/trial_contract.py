@@ -201,7 +201,8 @@ class Trial(Protocol):
     def checkpoint_folder(self, iteration: int) -> Path:
         """Return a local folder with a checkpoint's files, to read only; it is removed with the checkpoint.
 
-        If there is no such checkpoint, the folder does not exist.
+        If there is no such checkpoint, the folder does not exist. Of an object store, it is a copy, which is there as
+        long as this trial or its sweep is kept.
 
         Raises:
             CheckpointError: A symbolic link is in the way.
