@@ -270,8 +270,7 @@ def test_rmsprop_is_torchs_row_by_row(momentum: list[float]) -> None:
 
 @pytest.mark.usefixtures("in_double")
 def test_the_norm_of_all_of_a_members_networks_is_clipped() -> None:
-    rng = torch.Generator().manual_seed(0)
-    before = torch.randn(6, NUM_WEIGHTS, generator=rng)
+    before = torch.randn(6, NUM_WEIGHTS, generator=torch.Generator().manual_seed(0))
     before[[0, 3]] *= 0.01
     limits = torch.tensor([[1.0], [0.5], [math.inf]])
     after = before.clone()
