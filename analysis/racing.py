@@ -9,7 +9,6 @@ possible that it is the best. Decision 29 compares this with other ways to spend
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -77,12 +76,13 @@ class Race:
     def _still_in(self, scores: Mapping[int, Sequence[float]], size: int) -> list[int]:
         known = [scores[index] for index in self.contenders]
         means = dict(zip(self.contenders, expected_means(known), strict=True))
-        possible = list(self.contenders)
-        # Of scores so large that their squares are no numbers, nothing says who cannot win.
-        with contextlib.suppress(ValueError):
+        try:
             # The same scores decide the same, whenever it is asked.
-            chances = probability_of_being_best(known, rng=random_streams.fixed())
-            possible = [index for index, chance in zip(possible, chances, strict=True) if chance >= HARDLY_POSSIBLE]
+            chances = list(probability_of_being_best(known, rng=random_streams.fixed()))
+        except ValueError:
+            # Of scores so large that their squares are no numbers, nothing says who cannot win.
+            chances = [1.0] * len(known)
+        possible = [index for index, chance in zip(self.contenders, chances, strict=True) if chance >= HARDLY_POSSIBLE]
         return sorted(possible, key=lambda index: -means[index])[:size]
 
 

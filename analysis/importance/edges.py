@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from analysis.domains import is_log_kind
 from analysis.importance.answer import Edge
 from analysis.importance.model import Fit, Floats, Terms
 from analysis.importance.searched import Searched
@@ -133,7 +134,7 @@ def _beyond(item: Searched, side: str) -> list[float]:
     values = [beyond, *(limit for limit in (0.0, 1.0) if min(beyond, end) < limit < max(beyond, end))]
     if item.is_whole:
         values = [round(value) for value in values]
-    if item.is_on_log_scale:
+    if is_log_kind(item.kind):
         values = [value for value in values if value > 0]
     return [value for value in values if (value < end if side == "low" else value > end)]
 

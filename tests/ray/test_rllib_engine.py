@@ -199,6 +199,7 @@ def test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_a
     """They would sample with an untrained policy. By another setting, it is a copy for a population."""
     from ray import cloudpickle
 
+    from policies.rllib.config import build_algorithm_config
     from tune_jobs.training import rllib
     from tune_jobs.training.env_runner import EnvRunner
 
@@ -209,9 +210,17 @@ def test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_a
 
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     monkeypatch.setattr(rllib, "EnvRunner", Slow)
+    build = build_algorithm_config
+
+    def with_a_limit(*args: Any, **kwargs: Any) -> Any:
+        return build(*args, **kwargs).env_runners(sample_timeout_s=60.0)
+
+    # As checkpoints are that were written before; of itself, a config has none.
+    monkeypatch.setattr(rllib, "build_algorithm_config", with_a_limit)
     engine.build(make_task(tmp_path, "ppo", num_env_runners=1), None)
     engine.train_iteration()
     folder = save(engine, tmp_path / "000001")
+    monkeypatch.setattr(rllib, "build_algorithm_config", build)
     engine.build(make_task(tmp_path, "ppo", num_env_runners=1, **changes), folder)
     algorithm = engine.algorithm
     assert algorithm.config.sample_timeout_s is None

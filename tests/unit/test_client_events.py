@@ -14,10 +14,9 @@ from sweep_folders import make_sweep_folder
 
 from policies.errors import CannotRunError, NotFoundError, TuneJobsError
 from tests.narrowing import present
-from tune_jobs.client import Client, Event, NoServiceError, event_stream
+from tune_jobs.client import Client, Event, NoServiceError, UnavailableError, event_stream
 from tune_jobs.client import client as client_module
 from tune_jobs.client.event_stream import Parser
-from tune_jobs.client.problems import UnavailableError
 from tune_jobs.service.views import SweepView
 
 # ruff: noqa: F811 - fixtures are named as arguments

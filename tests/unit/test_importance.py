@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from known_scores import SPACE, Score, by_activation, by_log_lr, draw, effect_of, slope_of_log_lr, sweep_of
 
+from analysis.importance.edges import _beyond
+from analysis.importance.searched import Searched
 from analysis.records import ChangeRecord
 
 
@@ -187,6 +189,13 @@ class TestEdges:
         mattered = sweep_of(draw(60), near_the_end, noise=0.1, algorithm="ppo").mattered
         assert mattered.hyperparams[0].is_clear
         assert mattered.edges == ()
+
+    @pytest.mark.parametrize(
+        ("kind", "arguments", "found"), [("lograndint", (1, 100), set()), ("choice", (1, 10, 100), {0})]
+    )
+    def test_no_value_is_proposed_that_a_log_scale_lacks(self, kind: str, arguments: Any, found: set[int]) -> None:
+        searched = Searched("learning_starts", kind, arguments, (1, 10, 100, 1, 1))
+        assert {value for value in _beyond(searched, "low") if value <= 0} == found
 
     def test_no_value_is_proposed_that_the_algorithm_refuses(self) -> None:
         rng = np.random.default_rng(0)

@@ -116,6 +116,15 @@ def test_returns_that_are_not_numbers_are_called_so(fast_and_slow: Synthetic) ->
             ),
             "All 2 settings scored 189.0: the data can't order them.",
         ),
+        # A failure has the worst score, and nobody has scored it.
+        (
+            settings_of(
+                setting(1, ["t0000", "t0001"], 0, probability_best=0.5),
+                setting(2, ["t0002", "t0003"], 0, probability_best=0.5, scores=(189.0, 189.0), num_failed=2),
+                num_settings=2,
+            ),
+            "lr 0.1 leads: it scored 189.0 in the later half of training",
+        ),
         (
             settings_of(
                 setting(1, ["t0000", "t0001"], None, probability_best=0.5, scores=(-3.0, -5.0), score=-4.0),

@@ -88,6 +88,15 @@ def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name: str)
     load_spec({**MINIMAL, "num_samples": 4, "space": {name: {"choice": values}}})
 
 
+def test_a_population_refuses_to_change_what_target_updates_are_counted_in() -> None:
+    """The count of the last one is copied, in the other's unit."""
+    space = {**LR, "target_update_unit": {"choice": ["env_step", "episode"]}}
+    assert "space.target_update_unit: can't be changed within a trial" in errors(
+        **PBT | {"algorithm": "dqn", "space": space}
+    )
+    load_spec({**MINIMAL, "algorithm": "dqn", "num_samples": 4, "space": space})
+
+
 def test_a_grid_is_a_population_of_its_values() -> None:
     spec = load_spec({**MINIMAL, "space": {"lr": {"grid": [1e-4, 1e-3, 1e-2]}}, "scheduler": "pbt"})
     assert spec.perturb_every_env_steps == 20_000

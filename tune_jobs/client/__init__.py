@@ -2,6 +2,6 @@
 
 from tune_jobs.client.client import Client
 from tune_jobs.client.event_stream import Event
-from tune_jobs.client.problems import ConflictError, LostConnectionError, NoServiceError
+from tune_jobs.client.problems import ConflictError, LostConnectionError, NoServiceError, UnavailableError
 
-__all__ = ["Client", "ConflictError", "Event", "LostConnectionError", "NoServiceError"]
+__all__ = ["Client", "ConflictError", "Event", "LostConnectionError", "NoServiceError", "UnavailableError"]

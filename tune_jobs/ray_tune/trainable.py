@@ -49,6 +49,7 @@ from tune_jobs.training.trial_loop import TrialLoop
 REPORT_INTERVAL_S = 1.0
 _POINTER = "pointer.json"
 _NO_FOLDER = "/no-folder-of-checkpoints-of-tune"
+"""Where Tune believes a checkpoint to be; nobody looks there."""
 _LONGEST_WATCH_S = 1e9
 """Thirty years, in seconds; the fault handler's clock overflows at 300 years."""
 

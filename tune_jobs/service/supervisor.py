@@ -215,8 +215,7 @@ class Supervisor:
         for job in self._queue.jobs("running"):
             self._look_at(job)
         # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
-        free = {job.sweep for job in self._queue.jobs("waiting")} - {job.sweep for job in self._queue.jobs("running")}
-        free = {name for name in free if self._may_run(name)}
+        free = {name for name in {job.sweep for job in self._queue.jobs("waiting")} if self._may_run(name)}
         while not self._draining.is_set():
             claimed = self._queue.claim(self._where.num_cpus, free.__contains__)
             if claimed is None:

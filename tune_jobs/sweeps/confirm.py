@@ -6,8 +6,8 @@ race, and an equal spec and seed give an equal one.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from typing import Any
 
 from analysis.objectives import SettingScores, reached_goal
 from analysis.racing import Race, race_within
@@ -54,13 +54,10 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
 
 def different_points(settings: Sequence[SettingScores]) -> list[int]:
     """Return the points of settings in their order, of equal values only the first: no setting races with itself."""
-    seen: list[dict[str, Any]] = []
-    points = []
+    first: dict[str, int] = {}
     for item in settings:
-        if item.point not in seen:
-            seen.append(item.point)
-            points.append(item.point_index)
-    return points
+        first.setdefault(json.dumps(item.point, sort_keys=True), item.point_index)
+    return list(first.values())
 
 
 def recent_rounds(record: SweepRecord) -> list[ReplicationRecord]:
