@@ -31,49 +31,50 @@ $(VENV)/bin/python:
 		{ echo "tune-jobs needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=python3.11"; exit 5; }
 	$(PYTHON) -m venv $(VENV)
 
-# Editable, so that an edit acts at once; the wheel is tested on its own.
+# Editable, so that an edit acts at once; the wheel is tested on its own. pip compiles what it installs, one file after
+# the other, which takes longer than the rest of its work: all cores do it at the end, but for files that aren't Python.
+INSTALL := $(PIP) install --quiet --no-compile --constraint constraints.txt
+COMPILE := $(BIN)/python -W ignore -m compileall -qq -j 0 $(VENV)/lib || true
+
 $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) install --quiet --constraint constraints.txt $(TORCH)
-	$(PIP) install --quiet --constraint constraints.txt --editable .
+	$(INSTALL) $(TORCH)
+	$(INSTALL) --editable .
+	@$(COMPILE)
 	@touch $@
 
-# Box2D has wheels for some versions of Python only: without it what needs it is skipped, with the reason.
-$(VENV)/installed-test: $(VENV)/installed
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[test,docs]'
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[box2d]' || echo "Box2D cannot be installed here"
-	@touch $@
+# At once and not upon the other, which would look for the versions of all once more. Box2D has wheels for some versions
+# of Python only: without it what needs it is skipped, with the reason.
+$(VENV)/installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) $(TORCH)
+	$(INSTALL) --editable '.[test,docs]'
+	$(INSTALL) --editable '.[box2d]' || echo "Box2D cannot be installed here"
+	@$(COMPILE)
+	@touch $(VENV)/installed $@
 
 $(VENV)/installed-docs: $(VENV)/installed
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 $(VENV)/installed-bench: $(VENV)/installed
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[bench]'
+	$(INSTALL) --editable '.[bench]'
 	@touch $@
 
-# In five processes on two cores, as many of the tests wait for processes of their own: two parts of those in tests/ray,
-# each with a Ray of its own, the unit tests in two, followed by the third part of tests/ray, and the others; with the
-# types beside them. Each takes 17 to 20 minutes beside the others. What they print, skipped tests with their reasons too,
-# comes at the end. Processes by the hundred import the same modules: these are compiled once, whatever else the
-# environment says.
-RAY := tests/ray
-# It needs no Ray of the tests' own: it stands where there is time left.
-SERVED := $(RAY)/test_service.py
-LAST := $(filter-out $(SERVED),$(sort $(wildcard $(RAY)/test_s*.py)))
-OTHERS := $(filter-out $(RAY)/ tests/unit/,$(sort $(dir $(wildcard tests/*/test_*.py))))
+# In five processes on two cores, as many of the tests wait for processes of their own: two for those in tests/ray, each
+# with a Ray of its own and a file at a time, two for the unit tests, and one for the others; with the types beside them.
+# What they print, skipped tests with their reasons too, comes at the end. Processes by the hundred import the same
+# modules: these are compiled once, whatever else the environment says.
+OTHERS := $(filter-out tests/ray/ tests/unit/,$(sort $(dir $(wildcard tests/*/test_*.py))))
 PYTEST := $(BIN)/python -m pytest --durations=15 --durations-min=5
 test unit: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
-	$(PYTEST) $(RAY)/test_[a-ot-z]*.py > $(VENV)/tests-ray-1.log 2>&1 & first=$$!; \
-	$(PYTEST) $(RAY)/test_[p-r]*.py $(SERVED) > $(VENV)/tests-ray-2.log 2>&1 & second=$$!; \
-	( $(PYTEST) --numprocesses=2 tests/unit; ran=$$?; $(PYTEST) $(LAST); last=$$?; exit $$((ran || last)) ) \
-		> $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
+	$(PYTEST) --numprocesses=2 --dist=loadfile --no-loadscope-reorder tests/ray > $(VENV)/tests-ray.log 2>&1 & ray=$$!; \
+	$(PYTEST) --numprocesses=2 tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
 	$(PYTEST) $(OTHERS); others=$$?; \
 	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
-	wait $$first; first=$$?; cat $(VENV)/tests-ray-1.log; wait $$second; second=$$?; cat $(VENV)/tests-ray-2.log; \
+	wait $$ray; ray=$$?; cat $(VENV)/tests-ray.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \
-	exit $$((first || second || unit || others || types))
+	exit $$((ray || unit || others || types))
 
 test-slow: $(VENV)/installed-test
 	TUNE_JOBS_SLOW=only $(PYTEST)
