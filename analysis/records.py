@@ -274,6 +274,7 @@ class SweepRecord(Record):
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
     prior: tuple[PriorRecord, ...] = Field((), description="What its search began with, of earlier sweeps.")
+    env_threshold: float | None = Field(None, description="The env's own threshold when it was planned, if it has one.")
 
     @property
     def is_population(self) -> bool:

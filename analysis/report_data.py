@@ -16,6 +16,9 @@ def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
         return own
     if best is not None and best.confirmation.threshold is not None:
         return best.confirmation.threshold
+    if sweep.env_threshold is not None:
+        return sweep.env_threshold
+    # Sweeps of former versions have none of their record.
     import gymnasium
 
     # gymnasium.spec() would import the module that an id such as "module:Env-v0" names, so the registry is read.

@@ -14,7 +14,9 @@ from policies.envs.modules import allow_modules, allowed_again
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine, local_machine
+from tune_jobs.plan.points import num_trials_of
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
+from tune_jobs.search.given_points import given_points
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
@@ -196,6 +198,14 @@ class Submitter:
                 f"env.id: the environment {spec.env.id!r} is not one that may be used here.",
                 "Choose one that the service's operator allows (serve --env).",
             )
+        limits = self._config.limits
+        # Before it is planned: a request of somebody's must not have the service plan trials by the ten thousand.
+        num_trials = num_trials_of(spec, chosen_points=given_points(spec))
+        if num_trials > limits.trials:
+            raise SpecError(
+                f"The sweep has {num_trials:,} trials; here a sweep may have at most {limits.trials:,}.",
+                "Lower num_samples, seeds_per_point or the grids.",
+            )
         try:
             prior = read_priors(spec, self._config.storage, by_name=True)
             plan = make_plan(spec, self._machine(spec), prior=prior)
@@ -204,12 +214,6 @@ class Submitter:
             raise SpecError(error.message, error.hint) from error
         except CannotRunError as error:
             raise DoesNotFitError(error.message, error.hint) from error
-        limits = self._config.limits
-        if len(plan.trials) > limits.trials:
-            raise SpecError(
-                f"The sweep has {len(plan.trials):,} trials; here a sweep may have at most {limits.trials:,}.",
-                "Lower num_samples, seeds_per_point or the grids.",
-            )
         if limits.env_steps is not None and plan.max_env_steps > limits.env_steps:
             raise SpecError(
                 f"The sweep may train {plan.max_env_steps:,} env steps; here it may train at most "

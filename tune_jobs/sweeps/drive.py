@@ -59,6 +59,7 @@ def write_new(
             allowed_modules=modules_of(spec),
             chosen_points=given_points(spec),
             prior=plan.prior,
+            env_threshold=plan.env.threshold,
         )
     )
 

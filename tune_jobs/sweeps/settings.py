@@ -24,6 +24,8 @@ def judged(
 ) -> SettingsRecord | None:
     """Rank the settings of a sweep; None in a population, whose trials change theirs while they train.
 
+    None, too, where they are judged by the env steps to a threshold and nobody knows it any more.
+
     Args:
         spec: The sweep.
         trials: Its trials.
@@ -33,6 +35,8 @@ def judged(
     if spec.scheduler.is_population:
         return None
     goal = goal_of(spec, threshold)
+    if spec.objective.type == "steps_to_threshold" and goal is None:
+        return None
     return judge_settings(
         trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal,
         cost=spec.objective.cost,
