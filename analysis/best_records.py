@@ -86,6 +86,7 @@ class FrontRecord(Record):
     )
     num_undecided: Count | None = Field(None, description="How many these are; None: one seed a setting.")
     cheapest_near: FrontPointRecord = Field(description="The cheapest setting near the best.")
+    best_env_steps: float | None = Field(None, description="What the best one costs; None: a former record.")
     near_share: Number = Field(description="The share of what the best gained that one near it loses at most.")
     untrained: float | None = Field(None, description="The return that gains are counted from; None: it is not known.")
     near_score: Number = Field(description="The least expected score that is near the best.")

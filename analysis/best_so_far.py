@@ -55,7 +55,7 @@ def best_so_far(
     is_timed = all(is_moment(trial.started_at) for trial in trials)
     moments = []
     for trial in trials:
-        began = trial.started_at if is_timed and trial.started_at is not None else 0.0
+        began = trial.started_at - _earlier_s(trial) if is_timed and trial.started_at is not None else 0.0
         steps = 0
         for item in results.get(trial.trial_id, ()):
             moment = began + item.time_s if is_timed and math.isfinite(item.time_s) else began
@@ -71,6 +71,14 @@ def best_so_far(
             best = value
             found.append(Improvement(spent, value, trial.trial_id, item.num_env_steps))
     return BestSoFar(tuple(found), spent, is_timed)
+
+
+def _earlier_s(trial: TrialRecord) -> float:
+    """Return the seconds of the attempts before the one that `started_at` is of; times of iterations count them too."""
+    if trial.started_at is None or not is_moment(trial.ended_at) or trial.ended_at is None:
+        return 0.0
+    earlier = trial.time_s - (trial.ended_at - trial.started_at)
+    return earlier if 0.0 < earlier < _LAST_MOMENT else 0.0
 
 
 def is_moment(time: float | None) -> bool:

@@ -52,6 +52,27 @@ def busy_seconds(trials: Sequence[TrialRecord]) -> float | None:
     return total
 
 
+def busy_cores(trials: Sequence[TrialRecord], costs: Mapping[str, float]) -> float | None:
+    """Return how many cores were busy in the mean while any of the trials was in training; None: it is not known.
+
+    It is known of latest attempts alone: `started_at` is of these, and what a trial cost is of all, so as much of that
+    is counted as the share of its time that the latest one has.
+
+    Args:
+        trials: The trials of one sweep.
+        costs: Their core-seconds, see `core_seconds`.
+    """
+    busy = busy_seconds(trials)
+    if busy is None or not costs:
+        return None
+    latest = 0.0
+    for trial in trials:
+        cost, span = costs.get(trial.trial_id), _span(trial)
+        if cost is not None:
+            latest += cost if span is None else cost * min(1.0, (span[1] - span[0]) / trial.time_s)
+    return latest / busy
+
+
 def _span(trial: TrialRecord) -> tuple[float, float] | None:
     """Return when the trial was trained, in its latest attempt; of a running one, so far."""
     if trial.started_at is None or not math.isfinite(trial.started_at):

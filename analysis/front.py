@@ -67,6 +67,7 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
         undecided=tuple(map(told, undecided[:_NUM_UNDECIDED])),
         num_undecided=None if may_be is None else len(undecided),
         cheapest_near=told(cheapest),
+        best_env_steps=ranking[0].cost,
         near_share=NEAR,
         untrained=untrained,
         near_score=near_score,

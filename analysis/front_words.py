@@ -52,7 +52,9 @@ def cheapest_near_text(front: FrontRecord | None) -> str:
     if near.rank == 1:
         return "the best setting itself: no cheaper one is near it"
     point = ", ".join(f"{name} {setting_text(value)}" for name, value in near.point.items())
-    whole = front.points[-1].num_env_steps if front.num_on_front == len(front.points) else None
+    whole = front.best_env_steps
+    if whole is None and front.points[-1].rank == 1:
+        whole = front.points[-1].num_env_steps
     share = f", {100 * near.num_env_steps / whole:.0f} % of the best one's" if whole else ""
     text = f"{point}: {return_text(near.score)} for {env_steps_text(near)} a training{share}"
     if front.may_be_best is None:

@@ -83,8 +83,9 @@ class Style:
 
 
 def escape(text: str) -> str:
-    """Escape text for matplotlib, which would read a pair of dollar signs as a formula."""
-    return text.replace("$", r"\$")
+    """Escape text for matplotlib: a pair of dollar signs is a formula there, and a label that begins with "_" is hidden."""
+    # A space of no width: the name is as it is.
+    return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:

@@ -14,17 +14,18 @@ def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
     own = finite_or_none(sweep.section("objective").get("threshold"))
     if own is not None:
         return own
-    if best is not None and best.confirmation.threshold is not None:
-        return best.confirmation.threshold
-    if sweep.env_threshold is not None:
-        return sweep.env_threshold
+    planned = finite_or_none(best.confirmation.threshold if best is not None else None)
+    planned = finite_or_none(sweep.env_threshold) if planned is None else planned
+    if planned is not None:
+        return planned
     # Sweeps of former versions have none of their record.
     import gymnasium
 
     # gymnasium.spec() would import the module that an id such as "module:Env-v0" names, so the registry is read.
     env_spec = gymnasium.registry.get(env_of(sweep))
-    if env_spec is not None and env_spec.reward_threshold is not None:
-        return float(env_spec.reward_threshold)
+    known = finite_or_none(env_spec.reward_threshold) if env_spec is not None else None
+    if known is not None:
+        return known
     stop = sweep.section("stop")
     wanted = [finite_or_none(stop.get(name)) for name in ("evaluation_return", "training_return")]
     return next((value for value in wanted if value is not None), None)

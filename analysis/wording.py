@@ -31,11 +31,12 @@ def number(value: Any) -> str:
 
 
 def _rounded(value: float, digits: int) -> str:
-    """Return a number with some significant digits, and more where it would seem to be 1: 0.99987 is not."""
+    """Return a number with some significant digits; near 1, as many of what it lacks: a gamma of 0.9904 is not 0.99."""
     text = f"{value:.{digits}g}"
-    if text != "1" or value >= 1:
+    if not 0.9 <= value < 1:
         return text
-    return f"{value:.{1 - math.floor(math.log10(1.0 - value))}f}".rstrip("0")
+    decimals = max(digits, digits - 1 - math.floor(math.log10(1.0 - value)))
+    return f"{value:.{decimals}f}".rstrip("0")
 
 
 def counted(count: int, noun: str, plural: str | None = None) -> str:

@@ -137,5 +137,15 @@ def _binned(column: Column, indices: Sequence[int]) -> tuple[Axis, list[int]]:
     edges = np.linspace(scaled.min(), scaled.max(), num_bins + 1)
     places = np.clip(np.searchsorted(edges, scaled, side="right") - 1, 0, num_bins - 1)
     shown = 10**edges if column.axis.kind == "log" else edges
-    labels = [f"{float(low):.2g} to {float(high):.2g}" for low, high in itertools.pairwise(shown)]
+    labels = [f"{low} to {high}" for low, high in itertools.pairwise(_told_apart(shown.tolist()))]
     return Axis(column.axis.name, "category", tuple(labels)), [int(item) for item in places]
+
+
+def _told_apart(numbers: Sequence[float]) -> list[str]:
+    """Return increasing numbers in as few digits as tell them apart, two at least."""
+    for digits in range(2, 16):
+        # Twice, as 1,050 of three digits alone is 1.05e+03.
+        texts = [f"{float(f'{value:.{digits}g}'):.15g}" for value in numbers]
+        if len(set(texts)) == len(texts):
+            break
+    return texts

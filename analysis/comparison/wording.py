@@ -67,7 +67,8 @@ def _lines(pair: Pair, objective: Objective) -> list[str]:
             f"In the {counted(shared.num_settings, 'setting')} that both have: P({left} > {right}) "
             f"{_share(shared.probability)}"
         )
-        lines.append(f"Their IQM there: {left} {_iqm(shared.left_iqm)}, {right} {_iqm(shared.right_iqm)}")
+        left_iqm, right_iqm = _iqm(shared.left_iqm, objective), _iqm(shared.right_iqm, objective)
+        lines.append(f"Their IQM there: {left} {left_iqm}, {right} {right_iqm}")
     elif pair.why_none_shared:
         lines.append(f"No setting in common: {pair.why_none_shared}.")
     return lines
@@ -77,14 +78,21 @@ def _share(estimate: Estimate) -> str:
     return f"{estimate.mean:.2f} ({estimate.lower:.2f} to {estimate.upper:.2f} with 95 %)"
 
 
-def _iqm(estimate: Estimate) -> str:
+def _iqm(estimate: Estimate, objective: Objective) -> str:
+    mean = _score_text(estimate.mean, objective)
     if not math.isfinite(estimate.lower):
-        return return_text(estimate.mean)
-    return f"{return_text(estimate.mean)} ({return_text(estimate.lower)} to {return_text(estimate.upper)})"
+        return mean
+    return f"{mean} ({_range(estimate.lower, estimate.upper, objective)})"
+
+
+def _range(lower: float, upper: float, objective: Objective) -> str:
+    # Fewer env steps are better, so that they are scored below zero.
+    ends = (upper, lower) if objective == "steps_to_threshold" else (lower, upper)
+    return " to ".join(_score_text(end, objective) for end in ends)
 
 
 def _signed(value: float, sign: float) -> str:
-    return f"{value:+,.0f}" if sign < 0 else f"{value:+z.1f}"
+    return f"{value:+z,.0f}" if sign < 0 else f"{value:+z.1f}"
 
 
 def _point(entry: Entry) -> str:
@@ -100,17 +108,18 @@ def _seeds(entry: Entry) -> str:
 
 
 def _score(value: float | None, entry: Entry) -> str:
-    if value is None:
-        return PLAIN_NONE
-    return f"{-value:,.0f}" if entry.objective == "steps_to_threshold" else return_text(value)
+    return PLAIN_NONE if value is None else _score_text(value, entry.objective)
+
+
+def _score_text(value: float, objective: Objective) -> str:
+    # An interval may go beyond what there can be: nothing is reached in less than no env steps.
+    return f"{max(0.0, -value):,.0f}" if objective == "steps_to_threshold" else return_text(value)
 
 
 def _interval(entry: Entry) -> str:
     if entry.lower is None or entry.upper is None:
         return PLAIN_NONE
-    # Fewer env steps are better, so that they are scored below zero.
-    ends = (entry.upper, entry.lower) if entry.objective == "steps_to_threshold" else (entry.lower, entry.upper)
-    return f"{_score(ends[0], entry)} to {_score(ends[1], entry)}"
+    return _range(entry.lower, entry.upper, entry.objective)
 
 
 def _solved(entry: Entry) -> str:

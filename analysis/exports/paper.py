@@ -159,7 +159,9 @@ def _draw_curve(axes: Axes, curve: Curve, label: str, color: str) -> None:
     whole = steps <= curve.first_end
     seeds = counted(curve.num_seeds, "seed")
     told = f"{label} ({seeds})" if label else seeds
-    axes.plot(steps[whole], mean[whole], color=color, linewidth=1.2, label=escape(told))
+    # A line of one place can't be seen.
+    marker = "o" if steps.size == 1 else ""
+    axes.plot(steps[whole], mean[whole], color=color, linewidth=1.2, marker=marker, markersize=3, label=escape(told))
     after = np.flatnonzero(~whole)
     if after.size:
         # The dashes begin where the line ends, so that there is no gap.

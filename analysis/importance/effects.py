@@ -121,7 +121,12 @@ def _parts(item: Searched) -> list[Part]:
             first, last, middle = (
                 item.unscaled(end) for end in (*ends[index : index + 2], ends[index : index + 2].mean())
             )
-            parts.append((f"{short_text(first)} to {short_text(last)}", middle, mask))
+            if item.is_whole:
+                # Those that are in it: an end may be in the next part.
+                inside = [item.values[place] for place in np.flatnonzero(mask)]
+                first, last = min(inside), max(inside)
+            label = short_text(first) if first == last else f"{short_text(first)} to {short_text(last)}"
+            parts.append((label, middle, mask))
     missing = item.is_missing & ~item.is_idle
     return [*parts, (NOT_SET, None, missing)] if missing.any() else parts
 

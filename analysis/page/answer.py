@@ -120,8 +120,10 @@ def _runner_up(source: Source, settings: SettingsRecord) -> list[str]:
         return [sure]
     one, two = _median(source, settings, best), _median(source, settings, second)
     if _as_reliable(best, second) and one is not None and two is not None and one != two:
-        how = "slower" if two > one else "faster, though it scored less in the end"
-        return [sure, f"{point_text(second.point)} is as reliable but {how} ({number(round(two))} env steps)."]
+        # Settings are ranked by what is to be expected of them: one of fewer seeds may have scored more.
+        less = ", though it scored less" if second.score < best.score else ""
+        how = "but slower" if two > one else f"and faster{less}"
+        return [sure, f"{point_text(second.point)} is as reliable {how} ({number(round(two))} env steps)."]
     return [sure, f"Next comes {point_text(second.point)}: {_outcome(source, settings, second)}."]
 
 

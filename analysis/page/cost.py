@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from analysis.core_seconds import busy_seconds
+from analysis.core_seconds import busy_cores, busy_seconds
 from analysis.objectives import reached_goal
 from analysis.page.source import Source
 from analysis.records import TrialRecord, length_of
@@ -56,11 +56,14 @@ def _wall_time(source: Source) -> list[tuple[str, str]]:
     busy, total = busy_seconds(source.trials), source.sweep.run_time_s
     if not total > 0:
         return []
-    text = duration(total)
+    text, cores = duration(total), busy_cores(source.trials, source.core_seconds)
+    if cores:
+        # Of all attempts, of which the records say when the latest ones were.
+        busy = sum(source.core_seconds.values()) / cores
     if busy is not None and busy <= total:
         text += f", of which {duration(busy)} in training"
-        if source.core_seconds:
-            text += f" with {sum(source.core_seconds.values()) / busy:.1f} cores busy in the mean"
+        if cores:
+            text += f" with {cores:.1f} cores busy in the mean"
     return [("wall time", text)]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 
-from analysis.core_seconds import busy_seconds
+from analysis.core_seconds import busy_cores
 from analysis.page.source import Source
 from analysis.racing import Race
 from analysis.wording import duration
@@ -19,12 +19,12 @@ def takes(source: Source, num_trainings: int) -> str:
     They cost what the trials of the sweep cost in the mean, as many cores are busy as were, and starting and finishing
     takes as long as it did.
     """
-    costs, busy = source.core_seconds, busy_seconds(source.trials)
-    if not costs or not busy or num_trainings < 1:
+    costs, busy_ones = source.core_seconds, busy_cores(source.trials, source.core_seconds)
+    if not busy_ones or num_trainings < 1:
         return ""
-    cores = max(sum(costs.values()) / busy, 1.0)
+    cores = max(busy_ones, 1.0)
     training = num_trainings * statistics.fmean(costs.values()) / cores
-    others = max(0.0, source.sweep.run_time_s - busy) / (1 + len(source.sweep.replications))
+    others = max(0.0, source.sweep.run_time_s - sum(costs.values()) / busy_ones) / (1 + len(source.sweep.replications))
     return duration(training + others, tenths=False, none="")
 
 

@@ -44,7 +44,7 @@ def reward_as_number(reward: Any) -> float:
 
 
 class PlainSteps(gym.Wrapper[Any, Any, Any, Any]):
-    """Wraps a sub-environment of a vector: its rewards are plain numbers, and its infos are empty.
+    """Wraps a sub-environment of a vector: its actions and rewards are plain numbers, and its infos are empty.
 
     Nothing here reads infos, but Gymnasium makes arrays of them, and fails where two environments' infos differ in type
     or shape, or where a number has more than 64 bits.
@@ -57,6 +57,9 @@ class PlainSteps(gym.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment."""
+        # Gymnasium takes them from an array, and NumPy's scalars fail `isinstance(action, int)` in some environments.
+        if isinstance(action, np.integer):
+            action = int(action)
         observation, reward, terminated, truncated, _ = self.env.step(action)
         return observation, reward_as_number(reward), terminated, truncated, {}
 

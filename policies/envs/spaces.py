@@ -157,7 +157,8 @@ def _any_from_description(description: Mapping[str, Any]) -> gym.Space[Any]:
         shape = _checked_shape(description)
         return gym.spaces.MultiBinary(shape if len(shape) != 1 else shape[0])
     if kind == "dict":
-        return gym.spaces.Dict({key: _any_from_description(inner) for key, inner in description["members"]})
+        # As pairs: Gymnasium sorts a dict's keys, and the space that is described may have them in another order.
+        return gym.spaces.Dict([(key, _any_from_description(inner)) for key, inner in description["members"]])
     if kind == "tuple":
         return gym.spaces.Tuple([_any_from_description(inner) for inner in description["members"]])
     if kind == "box":

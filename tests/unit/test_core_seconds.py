@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from analysis.core_seconds import busy_seconds, core_seconds
+from analysis.core_seconds import busy_cores, busy_seconds, core_seconds
 from analysis.records import TrialRecord
 
 
@@ -57,3 +57,13 @@ def test_what_is_not_known_is_left_out() -> None:
     assert core_seconds([]) == {}
     assert busy_seconds([]) is None
     assert busy_seconds([trial(0, 0.0, 2.0), trial(1, 1.0, 3.0), trial(2, 7.0, 8.0)]) == pytest.approx(4.0)
+
+
+def test_a_resumed_trial_keeps_no_more_cores_busy_than_it_has() -> None:
+    """It trained for 1,000 s in all, and 100 s of them in the attempt that its times are of."""
+    alone = [trial(0, 1000.0, 1100.0, time_s=1000.0)]
+    assert busy_cores(alone, core_seconds(alone)) == pytest.approx(1.0)
+    two = [*alone, trial(1, 1000.0, 1100.0, pid=2)]
+    assert busy_cores(two, core_seconds(two)) == pytest.approx(2.0)
+    assert busy_cores([], {}) is None
+    assert busy_cores([trial(0, None, None, time_s=5.0)], {}) is None

@@ -205,6 +205,16 @@ def test_a_suffix_is_added_and_a_folder_for_tables_is_no_file(tmp_path: Path, mo
         tune_jobs.export("mine", "csv", output="mine.tex", storage=tmp_path)
 
 
+def test_a_folder_that_is_there_gets_a_file_of_the_usual_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = make_sweep_folder(tmp_path / "sweeps" / "mine")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for output, at in ((".", "here/mine.tex"), ("..", "mine.tex"), (tmp_path / "sweeps", "sweeps/mine.tex")):
+        (path,) = tune_jobs.export(store.folder, "latex", output=output).values()
+        assert path.resolve() == (tmp_path / at).resolve()
+        assert path.read_text().startswith("%")
+
+
 def test_several_sweeps_are_for_figures_alone(tmp_path: Path) -> None:
     make_sweep_folder(tmp_path / "mine")
     with pytest.raises(SpecError, match="2 sweeps were given; csv is of one"):

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from policies.acting.policy import RandomPolicy
 from policies.envs.flat import FlatBox, needs_flattening
 from policies.envs.make import check_env, make_env, make_vector_env
+from policies.envs.own_actions import Choices
 from policies.envs.spaces import describe_space, space_from_description
 from policies.errors import CheckpointError, EnvError, ObservationError
 
@@ -214,6 +215,24 @@ def test_the_space_is_described_and_read_again(kind: str) -> None:
     assert isinstance(read, FlatBox)
     assert read.original == made.original
     assert read == made
+
+
+def test_members_of_a_dict_keep_the_order_that_the_env_gave_them() -> None:
+    """Gymnasium sorts the keys of a dict, and of nothing else; two spaces of other orders are equal to it."""
+    inner = spaces.Dict([("z", spaces.Discrete(2)), ("a", spaces.Discrete(3))])
+    box = spaces.Box(-9.0, 9.0, (1,))
+    made = FlatBox(spaces.Dict(velocity=box, inner=inner, angle=box))
+    read = space_from_description(json.loads(json.dumps(describe_space(made))))
+    assert isinstance(read, FlatBox)
+    observation = {"angle": [2.0], "velocity": [1.0], "inner": {"a": 1, "z": 1}}
+    assert made.flat(observation).tolist() == [1, 0, 1, 0, 1, 0, 2]
+    np.testing.assert_array_equal(read.flat(observation), made.flat(observation))
+    for original, action in ((inner, [1, 2]), (spaces.Dict(steer=spaces.Discrete(2), gas=spaces.Discrete(2)), [1, 0])):
+        choices = Choices(original)
+        again = space_from_description(json.loads(json.dumps(describe_space(choices))))
+        assert isinstance(again, Choices)
+        assert again.own(np.array(action)) == choices.own(np.array(action))
+        assert list(again.own(np.array(action)).values()) == action
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,18 @@ def test_the_cheapest_near_the_best_loses_a_twentieth_of_what_training_gained_at
     assert present(front_of(equal, 500.0)).cheapest_near.point_index == 1
 
 
+def test_what_the_cheapest_saves_is_counted_from_the_best_one() -> None:
+    """Of two that score the same, the dearer is the best one by its number, and not on the front."""
+    found = present(front_of(ranked(setting(0, [500.0], 100_000), setting(1, [500.0], 20_000)), 20.0))
+    assert (found.cheapest_near.point_index, found.num_on_front, found.best_env_steps) == (1, 1, 100_000)
+    told = "lr 1: 500.0 for 20,000 env steps a training, 20 % of the best one's"
+    assert cheapest_near_text(found).startswith(told)
+    # A former record doesn't say what the best one costs.
+    former = found.model_copy(update={"best_env_steps": None})
+    assert cheapest_near_text(former).startswith("lr 1: 500.0 for 20,000 env steps a training")
+    assert "%" not in cheapest_near_text(former)
+
+
 def test_what_the_untrained_score() -> None:
     def rows(*returns: tuple[float, ...]) -> list[IterationRecord]:
         return [

@@ -9,6 +9,7 @@ import pytest
 from sweep_folders import kept_before_each_write, make_sweep_folder, train
 
 from analysis.records import FINISHED, ReplicationRecord, TrialRecord
+from policies.errors import SpecError
 from tune_jobs.service import driver
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import stages
@@ -107,3 +108,17 @@ def test_a_race_of_another_size_and_one_after_more_points_are_others(store: Swee
     assert len(rounds(begun[0])) == 1
     race(begun[0])
     assert [item.race for item in rounds(begun[0])][:2] == ["race-0", "race-1"]
+
+
+def test_no_setting_races_with_itself(store: SweepStore, tmp_path: Path) -> None:
+    """Random search in a small space draws points again, which are settings of their own."""
+    space = {"activation": {"choice": ["relu", "tanh"]}}
+    few = make_sweep_folder(tmp_path / "few", space=space, num_samples=6, seeds_per_point=1)
+    points = {trial.point_index: trial.point["activation"] for trial in few.read_trials()}
+    assert len(points) == 6
+    race(few.folder, top=5)
+    contenders = {point for item in rounds(few.folder) for point in item.points}
+    assert sorted(points[point] for point in contenders) == ["relu", "tanh"]
+    same = make_sweep_folder(tmp_path / "same", space={"activation": {"choice": ["relu"]}}, num_samples=2)
+    with pytest.raises(SpecError, match="has one setting that was trained"):
+        race(same.folder)

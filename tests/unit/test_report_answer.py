@@ -45,7 +45,15 @@ def test_one_that_is_as_reliable_but_slower_is_named(fast_and_slow: Synthetic) -
     assert "1 other can't be told from it" in " ".join(found.sentences)
     assert found.command == "tune-jobs replicate sweep"
     swapped = answer.section(source_of(fast_and_slow, settings_of(second, best, worse)))
-    assert "lr 0.1 is as reliable but faster, though it scored less in the end (" in " ".join(swapped.sentences)
+    assert "lr 0.1 is as reliable and faster (" in " ".join(swapped.sentences)
+    # It is ranked by what is to be expected of it: its mean may be higher, and lower.
+    for score, told in (
+        (second.score + 1.0, "and faster ("),
+        (second.score - 1.0, "and faster, though it scored less ("),
+    ):
+        other = best.model_copy(update={"score": score})
+        swapped = answer.section(source_of(fast_and_slow, settings_of(second, other, worse)))
+        assert f"lr 0.1 is as reliable {told}" in " ".join(swapped.sentences)
     unreliable = best.model_copy(update={"num_solved": 2})
     found = answer.section(source_of(fast_and_slow, settings_of(second, unreliable, worse)))
     assert "Next comes lr 0.1: 2 of 3 seeds reached 195" in " ".join(found.sentences)

@@ -146,7 +146,11 @@ def test_what_has_no_setting_has_no_steps_with_one() -> None:
         ({"grid": [1, 2]}, [3], {"grid": [1, 2]}),
         ({"uniform": [0.0, 1.0]}, [0.4, 0.8], {"uniform": [0.3, 0.9]}),
         ({"uniform": [0.0, 1.0]}, [0.1, 0.9], {"uniform": [0.05, 1.0]}),
-        ({"loguniform": [1e-6, 1.0]}, [1e-4, 1e-2], {"loguniform": [5e-5, 0.0316]}),
+        ({"loguniform": [1e-6, 1.0]}, [1e-4, 1e-2], {"loguniform": [5e-5, 0.0317]}),
+        ({"uniform": [0.9, 0.9999]}, [0.9958, 0.9960, 0.9964], {"uniform": [0.99565, 0.99655]}),
+        ({"uniform": [-5.0, 5.0]}, [-1.2345, -1.2], {"uniform": [-1.244, -1.191]}),
+        ({"uniform": [0.0, 1e6]}, [123_456.0, 234_567.0], {"uniform": [95_600.0, 263_000.0]}),
+        ({"quniform": [0.0, 1.0, 0.1]}, [0.3, 0.6], {"quniform": [0.2, 0.7, 0.1]}),
         ({"randint": [1, 100]}, [10, 20], {"randint": [7, 24]}),
         ({"qrandint": [0, 100, 10]}, [20, 40], {"qrandint": [10, 50, 10]}),
         ({"quniform": [0.0, 1.0, 0.25]}, [0.5, 0.5], {"quniform": [0.25, 0.75, 0.25]}),
@@ -156,6 +160,18 @@ def test_what_has_no_setting_has_no_steps_with_one() -> None:
 )
 def test_a_space_is_narrowed_to_where_points_did_well(domain: Any, values: list[Any], narrowed: Any) -> None:
     assert narrowed_space({"x": domain}, [{"x": value} for value in values]) == {"x": narrowed}
+
+
+def test_what_did_well_is_in_the_narrowed_space() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        kind = ("uniform", "loguniform")[rng.integers(2)]
+        low, high = np.sort(10.0 ** rng.uniform(-6, 3, 2)).tolist()
+        # Close to each other, where few digits are too few.
+        place = rng.uniform(0.0, 1.0) + 10.0 ** rng.uniform(-5, 0) * rng.uniform(0.0, 1.0, rng.integers(1, 5))
+        values = np.clip(low + (high - low) * place, low, high).tolist()
+        least, most = narrowed_space({"x": {kind: [low, high]}}, [{"x": value} for value in values])["x"][kind]
+        assert low <= least <= min(values) <= max(values) <= most <= high
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])

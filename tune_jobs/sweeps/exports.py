@@ -123,8 +123,8 @@ def export(
             `latex` a table of the leading settings (booktabs); `optuna` a study in a SQLite file; `pdf`, `svg` and
             `png` the learning curves of the leading settings; `sweep` one file that the service's page shows whoever
             opens it there. None: what the suffix of `output` says, such as `.tunejobs` or `.pdf`; else `csv`.
-        output: The folder (csv, parquet) or file to write; None: `NAME-csv`, `NAME-parquet`, `NAME.tex`, `NAME.db`,
-            `NAME.tunejobs`, `NAME.pdf`, ... in the current folder.
+        output: The folder (csv, parquet) or file to write; a folder that is there gets a file of the usual name. None:
+            `NAME-csv`, `NAME-parquet`, `NAME.tex`, `NAME.db`, `NAME.tunejobs`, `NAME.pdf`, ... in the current folder.
         top: How many settings the LaTeX table (10) or the figure (3 of each sweep) shows.
         storage: Folder for sweeps.
 
@@ -148,7 +148,9 @@ def export(
     store = find_sweep(names[0], storage)
     suffix = _SUFFIXES.get(kind, f"-{kind}")
     path = Path(f"{store.name}{suffix}") if output is None else expanded(output)
-    if kind in _SUFFIXES and path.suffix.lower() != suffix:
+    if kind in _SUFFIXES and path.is_dir():
+        path /= f"{store.name}{suffix}"
+    elif kind in _SUFFIXES and path.suffix.lower() != suffix:
         path = path.with_name(f"{path.name}{suffix}")
     if kind in FIGURES:
         from analysis.exports.paper import COLUMN_WIDTH, save_figure

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 
-from analysis.objectives import SettingScores
 from analysis.racing import Race
 from analysis.records import FINISHED, ReplicationRecord, SweepRecord
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.plan.sweep_plan import MAX_TRIALS
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import name_for_commands
+from tune_jobs.sweeps.confirm import different_points
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.races import NamedRace, last_race, race_named, ranking_of, round_of
 from tune_jobs.sweeps.resume import replicate
@@ -58,25 +58,26 @@ def run_race(
         # Only now, as the modules that the sweep's environment may need are allowed by the run.
         ranking = ranking_of(store)
         if race is None:
-            _check(store, ranking)
+            contenders = different_points(ranking)
+            _check(store, contenders)
             last = last_race(record) if name is None else None
-            if last is not None and _is_as_large(last, ranking, top, seeds):
+            if last is not None and _is_as_large(last, contenders, top, seeds):
                 race = last if was_cut or last.next_points(ranking) else None
         if race is None:
-            race = _new(record, ranking, top, seeds, name)
+            race = _new(record, different_points(ranking), top, seeds, name)
         known = race.name
         return round_of(record, race, race.next_points(ranking))
 
     return replicate(store, address, next_round, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes)
 
 
-def _check(store: Sweep, ranking: Sequence[SettingScores]) -> None:
-    if not ranking:
+def _check(store: Sweep, contenders: Sequence[int]) -> None:
+    if not contenders:
         raise NotFoundError(
             f"No setting of sweep {store.name} can be replicated: none of its trials was evaluated.",
             f"See why with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
         )
-    if len(ranking) == 1:
+    if len(contenders) == 1:
         raise SpecError(
             f"Sweep {store.name} has one setting that was trained: there is no other to race it with.",
             "Extend the sweep by more samples, or launch it anew with seeds_per_point for more seeds of the one.",
@@ -90,12 +91,12 @@ def _was_cut(store: Sweep) -> bool:
     return record.state != "completed" or ended < record.num_trials
 
 
-def _is_as_large(race: NamedRace, ranking: Sequence[SettingScores], top: int, seeds: int) -> bool:
-    return (len(race.race.contenders), race.race.num_seeds) == (min(top, len(ranking)), seeds)
+def _is_as_large(race: NamedRace, contenders: Sequence[int], top: int, seeds: int) -> bool:
+    return (len(race.race.contenders), race.race.num_seeds) == (min(top, len(contenders)), seeds)
 
 
-def _new(record: SweepRecord, ranking: Sequence[SettingScores], top: int, seeds: int, name: str | None) -> NamedRace:
-    race = Race(tuple(item.point_index for item in ranking[:top]), seeds)
+def _new(record: SweepRecord, contenders: Sequence[int], top: int, seeds: int, name: str | None) -> NamedRace:
+    race = Race(tuple(contenders[:top]), seeds)
     if race.max_trainings > MAX_TRIALS:
         raise SpecError(
             f"The race has up to {race.max_trainings:,} trainings (top {top:,}, seeds {seeds:,}); at most "
