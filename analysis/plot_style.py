@@ -83,7 +83,7 @@ class Style:
 
 
 def escape(text: str) -> str:
-    """Escape text for matplotlib: a pair of dollar signs is a formula there, and a label that begins with "_" is hidden."""
+    """Escape text for matplotlib: a pair of dollar signs is a formula there, a label that begins with "_" is hidden."""
     # A space of no width: the name is as it is.
     return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
 

@@ -23,6 +23,8 @@ from policies.envs.checked import check_observation, check_reward, is_sound, rew
 from policies.envs.classic_rows import ClassicRows
 from policies.envs.faults import close_env, env_failed
 from policies.envs.make import make_env
+from policies.envs.masks import MaskedBox
+from policies.envs.own_actions import Choices
 from policies.errors import EnvError, EnvFailedError, SpecError
 
 EndedBy = Literal["terminated", "truncated", "cap"]
@@ -232,7 +234,7 @@ def episode_steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_epis
         What there is after the reset and after each step; the last one is over.
 
     Raises:
-        EnvError: The env raised an error.
+        EnvFailedError: The env raised an error, or an observation is none of its space or not finite.
     """
     if isinstance(policy, Resettable):
         policy.reset(seed)
@@ -263,15 +265,23 @@ def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
         "actions": (policy.action_space, env.action_space),
     }
     for what, (ours, theirs) in pairs.items():
-        same = type(ours) is type(theirs) and ours.shape == theirs.shape
-        if same and isinstance(ours, gym.spaces.Discrete) and isinstance(theirs, gym.spaces.Discrete):
-            same = (ours.n, ours.start) == (theirs.n, theirs.start)
-        if not same:
+        if not _are_same(ours, theirs):
             env_id = env.spec.id if env.spec is not None else "this env"
             raise EnvError(
                 f"The policy is for {policy.env_id}, whose {what} are {ours}; those of {env_id} are {theirs}.",
                 f"Use it with {policy.env_id}.",
             )
+
+
+def _are_same(ours: gym.Space[Any], theirs: gym.Space[Any]) -> bool:
+    """Whether two spaces are of the same kind, shape and choices; bounds may differ."""
+    if type(ours) is not type(theirs) or ours.shape != theirs.shape:
+        return False
+    if isinstance(ours, gym.spaces.Discrete) and isinstance(theirs, gym.spaces.Discrete):
+        return (ours.n, ours.start) == (theirs.n, theirs.start)
+    if isinstance(ours, Choices | MaskedBox) and isinstance(theirs, Choices | MaskedBox):
+        return ours.sizes == theirs.sizes
+    return True
 
 
 def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
@@ -310,10 +320,12 @@ class _Running:
         self.length = 0
         self.total = 0.0
         self.has_terminated = False
+        self._shape = env.observation_space.shape
         try:
-            self.observation, _ = env.reset(seed=seed)
+            observation, _ = env.reset(seed=seed)
         except BaseException as error:  # an env may raise anything
             raise self._env_failed("reset", error) from error
+        self.observation = self._as_numbers(observation)
         check_observation(self.observation, self._env_id, 0)
 
     def step(self, action: Any) -> bool:
@@ -322,17 +334,39 @@ class _Running:
         if isinstance(action, np.generic):
             action = action.item()
         try:
-            self.observation, reward, terminated, truncated, _ = self.env.step(action)
+            observation, reward, terminated, truncated, _ = self.env.step(action)
             self.length += 1
             reward = reward_as_number(reward)
             self.total += reward
         except BaseException as error:  # an env may raise anything
             raise self._env_failed("step", error) from error
-        if not (math.isfinite(reward) and is_sound(np.asarray(self.observation))):
+        self.observation = self._as_numbers(observation)
+        if not (math.isfinite(reward) and is_sound(self.observation)):
             check_reward(reward, self._env_id, self.length)
             check_observation(self.observation, self._env_id, self.length)
         self.has_terminated = bool(terminated)
         return bool(terminated or truncated)
+
+    def _as_numbers(self, observation: Any) -> NDArray[Any]:
+        """Return an observation as an array, not copied.
+
+        Raises:
+            EnvFailedError: It is something other than numbers of the space's shape.
+        """
+        try:
+            array = np.asarray(observation)
+        except Exception:  # noqa: BLE001 (ragged lists, say)
+            array = np.empty(0, dtype=object)
+        if array.dtype.kind in "biuf" and array.shape == self._shape:
+            return array
+        method = "step" if self.length else "reset"
+        which = f"after env step {self.length}" if self.length else "from reset(), at the beginning"
+        what = "None" if observation is None else f"of shape {array.shape} and dtype {array.dtype}"
+        raise EnvFailedError(
+            f"The observation {which} of the episode of {self._env_id} with seed {self.seed} was {what}, not numbers "
+            f"of shape {self._shape}.",
+            f"Mend its {method}(): each observation must be of the observation space.",
+        )
 
     @property
     def _env_id(self) -> str:

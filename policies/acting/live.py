@@ -82,7 +82,7 @@ class LiveInfo:
 def watch_episode(
     policy: Policy, env_id: str, env_args: Mapping[str, Any] | None, seed: int, *, start: int = 0
 ) -> tuple[LiveInfo, Iterator[LiveStep]]:
-    """Begin an episode; what is returned plays it step by step.
+    """Begin an episode; what is returned plays it step by step, and closes the env at the end or when it is dropped.
 
     Args:
         policy: The policy that acts.
@@ -99,12 +99,15 @@ def watch_episode(
     env, why_not = _drawable(env_id, env_args)
     try:
         check_policy(policy, env)
+        fps = float(env.metadata.get("render_fps") or 30.0)
+        info = LiveInfo(env_id, policy.description, fps, not why_not, why_not, _actions(env))
     except BaseException:
         close_env(env)
         raise
-    fps = float(env.metadata.get("render_fps") or 30.0)
-    info = LiveInfo(env_id, policy.description, fps, not why_not, why_not, _actions(env))
-    return info, _steps(policy, env, seed, draws=not why_not, start=start)
+    steps = _steps(policy, env, seed, draws=not why_not, start=start)
+    # Only a generator that has begun closes the environment when it is closed or dropped.
+    next(steps)
+    return info, cast("Iterator[LiveStep]", steps)
 
 
 def _drawable(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[gym.Env[Any, Any], str]:
@@ -132,8 +135,10 @@ def _actions(env: gym.Env[Any, Any]) -> LiveActions:
     return LiveActions(None, None, _numbers(box.low), _numbers(box.high))
 
 
-def _steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, draws: bool, start: int) -> Iterator[LiveStep]:
+def _steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, draws: bool, start: int) -> Iterator[LiveStep | None]:
+    """Yield None, before anything is done, and then the steps."""
     try:
+        yield None
         for moment in episode_steps(policy, env, seed, max_episode_steps=episode_cap(env, None)):
             is_watched = moment.over or moment.num_env_steps >= start
             scores, kind = _scores(policy, moment.observation) if is_watched else (None, None)

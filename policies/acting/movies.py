@@ -31,7 +31,8 @@ _STILL_TIMEOUT_S = 30.0
 class Mp4Writer:
     """Writes H.264 in the form that browsers and players accept: yuv420p, even sizes, the index at the front.
 
-    A context manager; the file appears when the block ends without an error. All pictures have the size of the first.
+    A context manager; the file appears when the block ends without an error. Pictures of another size than the first
+    are fitted into it.
 
     Args:
         path: File to write.
@@ -45,6 +46,7 @@ class Mp4Writer:
         self._path, self._fps = path, fps
         self._stack = ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
+        self._size = (0, 0)
         self._errors: IO[bytes]
         self._temporary: Path
 
@@ -69,7 +71,10 @@ class Mp4Writer:
     def add(self, picture: Image.Image, times: int = 1) -> None:
         """Add a picture, `times` times in a row."""
         if self._process is None:
+            self._size = picture.size
             self._process = self._start(picture.size)
+        # The encoder cuts the bytes into pictures by their size alone.
+        picture = fitted(picture, self._size)
         data = (picture if picture.mode == "RGB" else picture.convert("RGB")).tobytes()
         assert self._process.stdin is not None
         try:
@@ -141,6 +146,22 @@ class Mp4Writer:
             self._process.wait()
 
 
+def fitted(picture: Image.Image, size: tuple[int, int]) -> Image.Image:
+    """Return a picture of a size: itself if it has that size, else scaled to fit, in the middle of a black one.
+
+    Args:
+        picture: A picture of any size.
+        size: The width and the height in pixels.
+    """
+    if picture.size == size:
+        return picture
+    scale = min(wanted / length for wanted, length in zip(size, picture.size, strict=True))
+    width, height = (max(1, round(length * scale)) for length in picture.size)
+    whole = Image.new("RGB", size)
+    whole.paste(picture.resize((width, height)), ((size[0] - width) // 2, (size[1] - height) // 2))
+    return whole
+
+
 def still_of(film: Path) -> bytes | None:
     """Return a telling picture of a film, as JPEG, for where films don't play; None: it can't be read."""
     import imageio_ffmpeg
@@ -161,7 +182,8 @@ def still_of(film: Path) -> bytes | None:
 class GifWriter:
     """Writes a looping GIF that plays in real time and has a bounded size.
 
-    It keeps fewer and smaller pictures of a long or colourful episode.
+    It keeps fewer and smaller pictures of a long or colourful episode. Pictures of another size than the first are
+    fitted into it.
 
     Args:
         path: File to write.
@@ -184,7 +206,9 @@ class GifWriter:
             hold_s: Seconds that it is shown for in addition; if not 0, the picture is never skipped.
         """
         if hold_s > 0 or self._count % self._stride == 0:
-            self._frames.append((self._time_s, hold_s > 0, draw()))
+            picture = draw()
+            size = self._frames[0][2].size if self._frames else picture.size
+            self._frames.append((self._time_s, hold_s > 0, fitted(picture, size)))
         self._count += 1
         self._time_s += 1.0 / self._fps + hold_s
         if len(self._frames) > _GIF_MAX_FRAMES:

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from policies.acting.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
-from policies.acting.movies import GifWriter, Mp4Writer
+from policies.acting.movies import GifWriter, Mp4Writer, fitted
 from policies.acting.policy import Policy
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
@@ -165,9 +165,14 @@ class _Stage:
     ) -> None:
         self._policy, self._title = policy, title
         self._env = _make_drawable_env(env_id, env_args)
-        check_policy(policy, self._env)
-        self._cap = episode_cap(self._env, max_steps)
-        self.fps = float(self._env.metadata.get("render_fps") or _DEFAULT_FPS)
+        self._size: tuple[int, int] | None = None
+        try:
+            check_policy(policy, self._env)
+            self._cap = episode_cap(self._env, max_steps)
+            self.fps = float(self._env.metadata.get("render_fps") or _DEFAULT_FPS)
+        except BaseException:
+            close_env(self._env)
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -198,7 +203,9 @@ class _Stage:
         zoom = -(-_MIN_WIDTH // picture.width)
         if zoom > 1:
             picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
-        return picture
+        # Here and not only where it is written, or the caption would be scaled with it.
+        self._size = self._size or picture.size
+        return fitted(picture, self._size)
 
 
 class _Film:

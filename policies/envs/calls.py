@@ -153,7 +153,8 @@ def watch_rows(rows: _Watched) -> _Watched:
 
 def watch_policy(policy: _Watched) -> _Watched:
     """Have a policy write its calls to the page, if this process is watched."""
-    return _watch(policy, {"act": Call.ACT, "act_on_row": Call.ACT})
+    # One of them may call another, as those of a class of the user's own do: that is a call inside a call.
+    return _watch(policy, {"act": Call.ACT, "act_on_row": Call.ACT, "act_on_rows": Call.ACT})
 
 
 def _watch(thing: _Watched, methods: dict[str, Call]) -> _Watched:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -320,7 +321,7 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
     observed = env.observation_space
     if source == "observation":
         assert isinstance(observed, gym.spaces.Dict)
-        if problem := _member_problem(observed, name, sum(sizes)):
+        if problem := _member_problem(observed, name, sizes):
             raise EnvError(f"{env_id} observes a mask of actions, {name!r}, {problem}.", hint)
     try:
         space = MaskedBox.of(observed, sizes, name if source == "observation" else None)
@@ -375,13 +376,17 @@ def _needs_nothing(method: Any) -> bool:
     return True
 
 
-def _member_problem(observed: gym.spaces.Dict, name: str, num: int) -> str:
+def _member_problem(observed: gym.spaces.Dict, name: str, sizes: tuple[int, ...]) -> str:
     if len(observed.spaces) == 1:
         return "and nothing else"
-    shape = observed[name].shape
-    if shape is not None and int(np.prod(shape)) == num:
+    member = observed[name]
+    # A Tuple has an array for each choice, in their order.
+    parts = member.spaces if isinstance(member, gym.spaces.Tuple) else [member]
+    found = [None if part.shape is None else math.prod(part.shape) for part in parts]
+    if found in ([sum(sizes)], list(sizes)):
         return ""
-    return f"of {shortened(observed[name])}, but there are {num} actions to allow"
+    choices = f", of the choices {list(sizes)}" if len(sizes) > 1 else ""
+    return f"of {shortened(member)}, but there are {sum(sizes)} actions to allow{choices}"
 
 
 def _name(env: gym.Env[Any, Any]) -> str:

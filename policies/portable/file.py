@@ -6,6 +6,10 @@ SHA-256 of the weights.
 
 Formats: version 1 had only layers; version 2 has all that `policies.portable.network` describes, and writes the bounds
 of a space as one number where they are all equal. Both can be read.
+
+JSON has no infinity and no NaN. In the arguments of an environment and of a user's own network, which decide what is
+made, they are objects such as {"$float": "-Infinity"}, and are read back as what they were; files of older versions
+have null there. In metadata they are null.
 """
 
 from __future__ import annotations
@@ -45,6 +49,8 @@ __all__ = [
 
 FORMAT_VERSION = 2
 READABLE_VERSIONS = (1, 2)
+_FLOAT = "$float"
+_NON_FINITE = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
 _MAX_CHARS = 400
 """The most characters of a problem that a message quotes."""
 
@@ -103,12 +109,14 @@ def save_policy(
 
     _check(policy, f"policy to save as {folder / stem}")
     network, tensors = network_to_json(policy.network)
+    if "module" in network:
+        network["module"]["model_config"] = _jsonable(network["module"]["model_config"], exact=True)
     weights: bytes = save(tensors)
     description = {
         "format_version": FORMAT_VERSION,
         "algorithm": policy.algorithm,
         "env_id": policy.env_id,
-        "env_args": policy.env_args,
+        "env_args": _jsonable(policy.env_args, exact=True),
         "observation_space": policy.observation_space,
         "action_space": policy.action_space,
         "action_transform": policy.action_transform,
@@ -206,14 +214,14 @@ def _assemble(description: dict[str, Any], weights: bytes, place: Path) -> Porta
 
     try:
         tensors = load(weights)
-        network = network_from_json(description["network"], tensors)
+        network = network_from_json(_with_exact_arguments(description["network"]), tensors)
         if tensors:
             raise _broken(place, f"does not describe the tensors {sorted(tensors)}")
         return PortablePolicy(
             network=network,
             algorithm=str(description["algorithm"]),
             env_id=str(description["env_id"]),
-            env_args=dict(description["env_args"]),
+            env_args={key: _from_exact(value) for key, value in dict(description["env_args"]).items()},
             observation_space=dict(description["observation_space"]),
             action_space=dict(description["action_space"]),
             action_transform=description["action_transform"],
@@ -242,16 +250,43 @@ def _check(policy: PortablePolicy, place: str) -> None:
         )
 
 
-def _jsonable(value: Any) -> Any:
-    """Return metadata in JSON's types: NumPy scalars as numbers, tuples as lists, NaN and infinity as null."""
+def _jsonable(value: Any, *, exact: bool = False) -> Any:
+    """Return a value in JSON's types: NumPy scalars as numbers, tuples as lists.
+
+    NaN and infinity become null; or, if it is to be exact, what `_from_exact` makes the same number again.
+    """
     if isinstance(value, Mapping):
-        return {str(key): _jsonable(item) for key, item in value.items()}
+        return {str(key): _jsonable(item, exact=exact) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_jsonable(item) for item in value]
+        return [_jsonable(item, exact=exact) for item in value]
     if isinstance(value, np.ndarray):
-        return _jsonable(value.tolist())
+        return _jsonable(value.tolist(), exact=exact)
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
-        return None
+        sign = "-" if value < 0 else ""
+        return {_FLOAT: "NaN" if math.isnan(value) else f"{sign}Infinity"} if exact else None
     return value if isinstance(value, (str, int, float, bool)) or value is None else str(value)
+
+
+def _from_exact(value: Any) -> Any:
+    """Return a value of a file with the numbers that JSON has no words for."""
+    if isinstance(value, list):
+        return [_from_exact(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if len(value) == 1 and isinstance(word := value.get(_FLOAT), str) and word in _NON_FINITE:
+        return _NON_FINITE[word]
+    return {key: _from_exact(item) for key, item in value.items()}
+
+
+def _with_exact_arguments(network: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of a network with the arguments of a user's own class as they were.
+
+    Raises:
+        KeyError, TypeError, ValueError: It is no description of a network.
+    """
+    if "module" not in network:
+        return network
+    module = dict(network["module"])
+    return {**network, "module": {**module, "model_config": _from_exact(module["model_config"])}}

@@ -322,7 +322,7 @@ def test_environments_of_a_vector_get_plain_numbers_as_actions() -> None:
     """Some ask `isinstance(action, int)`, as the tests' walk does; arrays of actions hold NumPy's."""
     register_test_envs()
     envs = make_vector_env("TestWalk-v0", {"end": 100.0}, 2)
-    envs.reset(seed=[0, 1])
+    envs.reset(seed=0)
     for _ in range(3):
         _, rewards, _, _, _ = envs.step(np.array([3, 4]))
     assert rewards[0] < rewards[1]

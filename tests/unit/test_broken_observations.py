@@ -1,0 +1,134 @@
+"""An observation that is none, in mid-episode: evaluations and films say where it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from policies.acting.baselines import ConstantPolicy
+from policies.acting.evaluate import evaluate_policy, play_episode
+from policies.acting.policy import RandomPolicy
+from policies.acting.video import record_video
+from policies.envs import calls
+from policies.envs.make import make_env
+from policies.errors import EnvFailedError
+
+ENV = "TestBreaks-v0"
+BROKEN: dict[str, Any] = {
+    "none": None,
+    "longer": np.zeros(3, np.float32),
+    "scalar": 1.0,
+    "ragged": [[1.0], [1.0, 2.0]],
+    "text": ["a", "b"],
+    "nested": np.zeros((1, 2), np.float32),
+}
+
+
+class Breaks(gym.Env[Any, Any]):
+    """Its second step, or its reset, returns something other than an observation."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, how: str, at: int = 2, render_mode: str | None = None) -> None:
+        self.how, self.at, self.render_mode, self.steps = how, at, render_mode, 0
+
+    def _seen(self) -> Any:
+        return BROKEN[self.how] if self.steps == self.at else [0.5, 0.25]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return self._seen(), 1.0, self.steps == 4, False, {}
+
+    def render(self) -> Any:
+        return np.zeros((20, 320, 3), np.uint8)
+
+
+@pytest.fixture(autouse=True)
+def _env() -> Iterator[None]:
+    register: Any = gym.register
+    register(ENV, Breaks)
+    yield
+    del gym.registry[ENV]
+
+
+def policy() -> RandomPolicy:
+    return RandomPolicy(Breaks.observation_space, Breaks.action_space, env_id=ENV)
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_an_evaluation_names_the_env_the_seed_and_the_step(how: str) -> None:
+    words = rf"after env step 2 of the episode of {ENV} with seed 7 was .*not numbers of shape \(2,\)"
+    with pytest.raises(EnvFailedError, match=words) as caught:
+        evaluate_policy(policy(), env_id=ENV, env_args={"how": how}, seeds=[7])
+    assert "step()" in caught.value.hint
+    assert ("was None," in caught.value.message) is (how == "none")
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_so_does_a_reset(how: str) -> None:
+    words = rf"from reset\(\), at the beginning of the episode of {ENV} with seed 7 was "
+    with pytest.raises(EnvFailedError, match=words) as caught:
+        evaluate_policy(policy(), env_id=ENV, env_args={"how": how, "at": 0}, seeds=[7])
+    assert "reset()" in caught.value.hint
+
+
+def test_so_do_episodes_side_by_side_and_films(tmp_path: Path) -> None:
+    constant = ConstantPolicy(Breaks.observation_space, Breaks.action_space, 0, env_id=ENV)
+    with pytest.raises(EnvFailedError, match=r"after env step 2 .* with seed 3 was of shape"):
+        evaluate_policy(constant, env_id=ENV, env_args={"how": "longer"}, seeds=[3, 4])
+    with pytest.raises(EnvFailedError, match=r"after env step 2 .* with seed 3 was None"):
+        record_video(constant, env_id=ENV, env_args={"how": "none"}, seeds=3, mp4=tmp_path / "a.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lists_of_numbers_pass() -> None:
+    env = make_env(ENV, {"how": "none", "at": 9})
+    assert play_episode(policy(), env, 0, max_episode_steps=9) == (4.0, 4)
+
+
+def test_a_watched_policy_tells_that_it_acts_on_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with (tmp_path / "page").open("w+b") as file:
+        file.truncate(calls.PAGE_BYTES)
+        page = calls.Page(file.fileno())
+    monkeypatch.setattr(calls, "_page", page)
+    inside = []
+
+    class Own(RandomPolicy):
+        """Acts by an `act` of its own, which is called by `act_on_rows`."""
+
+        def act(self, observations: Any, mask: Any = None) -> Any:
+            inside.append((page.call, page.count))
+            return super().act(observations, mask)
+
+        def _act_batch(self, observations: Any) -> Any:
+            inside.append((page.call, page.count))
+            return super()._act_batch(observations)
+
+    rows = np.zeros((3, 2), np.float32)
+    own = calls.watch_policy(Own(Breaks.observation_space, Breaks.action_space, env_id=ENV))
+    assert own.act_on_rows(rows).shape == (3,)
+    # A call inside a call: both count, and the outer one is what is left when the inner one has ended.
+    assert inside == [(calls.Call.ACT, 2), (calls.Call.ACT, 2)]
+    assert (page.call, page.count) == (calls.Call.NONE, 4)
+
+    class Plain(RandomPolicy):
+        def _act_batch(self, observations: Any) -> Any:
+            inside.append((page.call, page.count))
+            return super()._act_batch(observations)
+
+    plain = calls.watch_policy(Plain(Breaks.observation_space, Breaks.action_space, env_id=ENV))
+    plain.act_on_rows(rows)
+    assert inside[2:] == [(calls.Call.ACT, 5)]
+    assert (page.call, page.count) == (calls.Call.NONE, 6)

@@ -1,0 +1,135 @@
+"""Frames that change their size in a film, and environments that are closed though nothing is played."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from policies.acting.baselines import ConstantPolicy
+from policies.acting.live import watch_episode
+from policies.acting.movies import GifWriter, Mp4Writer, fitted
+from policies.acting.video import record_video
+from policies.errors import EnvError
+
+ENV = "TestGrows-v0"
+RED = (200, 0, 0)
+
+
+class Grows(gym.Env[Any, Any]):
+    """Its picture, all red, is larger after each step; counts who is open."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    num_open = 0
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode, self.steps = render_mode, 0
+        Grows.num_open += 1
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return np.zeros(2, np.float32), 1.0, self.steps == 4, False, {}
+
+    def render(self) -> Any:
+        return np.full((100 + 37 * self.steps, 340 + 22 * self.steps, 3), RED, np.uint8)
+
+    def close(self) -> None:
+        Grows.num_open -= 1
+
+
+@pytest.fixture(autouse=True)
+def _env(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(Grows, "num_open", 0)
+    register: Any = gym.register
+    register(ENV, Grows)
+    yield
+    del gym.registry[ENV]
+
+
+def policy(num_actions: int = 2) -> ConstantPolicy:
+    return ConstantPolicy(Grows.observation_space, gym.spaces.Discrete(num_actions), 0, env_id=ENV)
+
+
+def frames_of(path: Path) -> list[Any]:
+    reader = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(reader)["size"]
+    return [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in reader]
+
+
+def test_a_picture_is_fitted_into_a_size() -> None:
+    red = Image.new("RGB", (20, 40), RED)
+    assert fitted(red, (20, 40)) is red
+    pixels = np.array(fitted(red, (40, 20)))
+    assert pixels.shape == (20, 40, 3)
+    assert (pixels[:, 15:25] == RED).all()
+    assert not pixels[:, :15].any()
+    assert not pixels[:, 25:].any()
+
+
+def test_an_mp4_takes_pictures_of_other_sizes(tmp_path: Path) -> None:
+    sizes = [(64, 48), (70, 48), (64, 20), (30, 90), (64, 48)]
+    with Mp4Writer(tmp_path / "a.mp4", 10) as writer:
+        for size in sizes:
+            writer.add(Image.new("RGB", size, RED))
+    frames = frames_of(tmp_path / "a.mp4")
+    assert [frame.shape for frame in frames] == [(48, 64, 3)] * len(sizes)
+    for frame in frames:
+        assert np.abs(frame[20:28, 28:36] - RED).max() < 30
+    assert np.abs(frames[-1] - RED).max() < 30
+
+
+@pytest.mark.parametrize("max_bytes", [3_000_000, 100])
+def test_a_gif_takes_pictures_of_other_sizes(tmp_path: Path, max_bytes: int) -> None:
+    writer = GifWriter(tmp_path / "a.gif", 10, max_bytes=max_bytes)
+    for number, size in enumerate([(64, 48), (128, 96), (32, 24)]):
+        writer.add(lambda size=size, number=number: Image.new("RGB", size, (200, 0, 20 * number)), hold_s=0.1)  # type: ignore[misc]
+    writer.save()
+    with Image.open(tmp_path / "a.gif") as image:
+        for index in range(3):
+            image.seek(index)
+            pixels = np.array(image.convert("RGB")).astype(int)
+            assert (np.abs(pixels - (200, 0, 20 * index)).max(axis=-1) < 15).all()
+
+
+def test_a_film_of_an_env_whose_pictures_grow(tmp_path: Path) -> None:
+    record_video(policy(), env_id=ENV, seeds=[0, 1], mp4=tmp_path / "a.mp4", gif=tmp_path / "a.gif", caption="a")
+    frames = frames_of(tmp_path / "a.mp4")
+    assert {frame.shape for frame in frames} == {(126, 340, 3)}
+    for frame in frames:
+        assert np.abs(frame[40:110, 150:190] - RED).max() < 40
+        # The caption stays where it is, and as large as it is.
+        assert frame[4:22, -80:].max() > 150
+        assert np.abs(frame[:26, 200] - (24, 27, 34)).max() < 40
+    assert Grows.num_open == 0
+
+
+def test_a_policy_that_cannot_be_filmed_leaves_no_env_open(tmp_path: Path) -> None:
+    with pytest.raises(EnvError, match="whose actions are"):
+        record_video(policy(3), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4")
+    with pytest.raises(EnvError, match="cap on episode steps"):
+        record_video(policy(), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4", max_steps=0)
+    assert Grows.num_open == 0
+
+
+def test_an_episode_that_nobody_watches_leaves_no_env_open() -> None:
+    _, steps = watch_episode(policy(), ENV, {}, 0)
+    assert Grows.num_open == 1
+    steps.close()  # type: ignore[attr-defined]
+    assert Grows.num_open == 0
+    _, steps = watch_episode(policy(), ENV, {}, 0)
+    del steps
+    assert Grows.num_open == 0
+    assert len(list(watch_episode(policy(), ENV, {}, 0)[1])) == 5
+    assert Grows.num_open == 0
