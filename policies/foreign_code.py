@@ -9,11 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from policies.foreign_phases import rllib_phase, rllib_target, sb3_phase, sb3_target
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.schedules import linear
 
 _TORCH = {"linear": "Identity", "relu": "ReLU", "tanh": "Tanh", "silu": "SiLU", "elu": "ELU", "gelu": "GELU"}
 _FITS = 100
 """Columns that a call may take in one line."""
+_TORCHS_ADAM = {"optimizer_epsilon": 1e-8, "adam_beta1": 0.9, "adam_beta2": 0.999}
+"""Adam as RLlib makes it."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ def stable_baselines3_program(
     }
     if is_ppo:
         network["ortho_init"] = values.initializer == "orthogonal"
+    network |= _sb3_optimizer(values)
     if values.initializer == "he_uniform" or (values.initializer == "orthogonal" and not is_ppo):
         notes.append(f"initializer {values.initializer} is left out: it takes a policy class of your own.")
     if values.conv_filters is not None:
@@ -100,27 +105,31 @@ def rllib_program(values: TrainedHyperparams, *, env_id: str, env_args: Mapping[
     """
     arguments, notes = _rllib_ppo(values) if isinstance(values, PPOHyperparams) else _rllib_dqn(values)
     name = "PPO" if isinstance(values, PPOHyperparams) else "DQN"
-    model: dict[str, Any] = {
-        "fcnet_hiddens": list(values.hidden_sizes),
-        "fcnet_activation": "GELU" if values.activation == "gelu" else values.activation,
-    }
+    activation = "GELU" if values.activation == "gelu" else values.activation
+    model: dict[str, Any] = {"fcnet_hiddens": list(values.hidden_sizes), "fcnet_activation": activation}
     if isinstance(values, PPOHyperparams):
         model["vf_share_layers"] = values.vf_share_layers
         if values.free_log_std:
             model["free_log_std"] = True
     if values.conv_filters is not None:
         model["conv_filters"] = [list(item) for item in values.conv_filters]
+        model["conv_activation"] = activation
+        # RLlib's fcnet_hiddens are for vectors: after convolutions, dense layers are those of the heads.
+        del model["fcnet_hiddens"], model["fcnet_activation"]
+        model |= {"head_fcnet_hiddens": list(values.hidden_sizes), "head_fcnet_activation": activation}
         notes.append("RLlib pads the convolutions of conv_filters, which we don't.")
+        if values.vf_share_layers if isinstance(values, PPOHyperparams) else values.dueling:
+            notes.append("Each head has hidden_sizes of its own: RLlib's heads share the convolutions alone.")
     if values.initializer != "torch":
         notes.append(f"initializer {values.initializer} is left out: fcnet_kernel_initializer takes torch's functions.")
     runners: dict[str, Any] = {"num_env_runners": 0, "num_envs_per_env_runner": values.num_envs}
     if isinstance(values, DQNHyperparams):
-        runners["rollout_fragment_length"] = max(1, round(values.train_freq / values.num_envs))
+        runners["rollout_fragment_length"] = rllib_phase(values).num_vector_steps
     if values.normalize_observations:
         notes.append("normalize_observations is left out: RLlib's is a connector, MeanStdFilter.")
     schedule = values.lr if values.lr_final is None else [[0, values.lr], [values.lr_decay_steps, values.lr_final]]
-    clip = {} if values.grad_clip is None else {"grad_clip": values.grad_clip}
-    training = {"lr": schedule, "gamma": values.gamma, **clip, **arguments}
+    # RLlib's DQN clips at 40 if it isn't told.
+    training = {"lr": schedule, "gamma": values.gamma, "grad_clip": values.grad_clip, **arguments}
     chain = [
         f".environment({env_id!r}{_env_kwargs('env_config', env_args)})",
         _call(".env_runners", [], runners),
@@ -169,6 +178,18 @@ def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
     }, notes
 
 
+def _sb3_optimizer(values: TrainedHyperparams) -> dict[str, Any]:
+    """Return the arguments of SB3's policy that make our optimizer."""
+    if isinstance(values, PPOHyperparams):
+        # Torch's default; SB3's PPO has 1e-5.
+        return {"optimizer_kwargs": {"eps": _TORCHS_ADAM["optimizer_epsilon"]}}
+    epsilon = {"eps": values.optimizer_epsilon}
+    if values.optimizer == "adam":
+        return {"optimizer_kwargs": {**epsilon, "betas": (values.adam_beta1, values.adam_beta2)}}
+    moving = {"alpha": values.rmsprop_rho, "momentum": values.rmsprop_momentum}
+    return {"optimizer_class": _Code("torch.optim.RMSprop"), "optimizer_kwargs": {**epsilon, **moving}}
+
+
 def _sb3_dqn(values: DQNHyperparams, num_env_steps: int) -> tuple[dict[str, Any], list[str]]:
     lacks = {
         "double_q": values.double_q,
@@ -176,20 +197,38 @@ def _sb3_dqn(values: DQNHyperparams, num_env_steps: int) -> tuple[dict[str, Any]
         "replay " + values.replay: values.replay != "uniform",
         "td_loss mse": values.td_loss == "mse",
     }
-    train_freq = max(1, round(values.train_freq / values.num_envs))
+    phase = sb3_phase(values)
+    target, target_notes = sb3_target(values, phase)
+    exploration, exploration_notes = _sb3_exploration(values, num_env_steps)
     return {
         "buffer_size": values.replay_capacity,
         "learning_starts": values.learning_starts,
         "batch_size": values.train_batch_size,
-        "tau": values.tau,
-        "train_freq": train_freq,
-        "gradient_steps": max(1, round(values.updates_per_env_step * train_freq * values.num_envs)),
+        "train_freq": phase.num_vector_steps,
+        "gradient_steps": phase.num_updates,
         "n_steps": values.n_step,
-        "target_update_interval": values.target_update_interval or 1,
-        "exploration_fraction": min(1.0, values.epsilon_decay / max(1, num_env_steps)),
+        **target,
+        **exploration,
+    }, [*_dqn_notes("SB3", lacks | _lacking_in_both(values)), *phase.notes, *target_notes, *exploration_notes]
+
+
+def _sb3_exploration(values: DQNHyperparams, num_env_steps: int) -> tuple[dict[str, Any], list[str]]:
+    final, notes = values.epsilon_final, []
+    end = values.epsilon_decay
+    if values.epsilon_schedule == "linear" and values.epsilon_unit == "env_step":
+        end += values.epsilon_start
+        if end > num_env_steps:
+            decayed = max(0, num_env_steps - values.epsilon_start)
+            final = linear(values.epsilon_initial, values.epsilon_final, values.epsilon_decay, decayed)
+    if values.epsilon_start:
+        notes.append("epsilon_start is left out: SB3's epsilon falls from the first env step, to the same end.")
+    if values.learning_starts and (values.epsilon_initial < 1.0 or values.epsilon_start < values.learning_starts):
+        notes.append("SB3's actions are all random until learning_starts, ours as epsilon says.")
+    return {
+        "exploration_fraction": min(1.0, end / max(1, num_env_steps)),
         "exploration_initial_eps": values.epsilon_initial,
-        "exploration_final_eps": values.epsilon_final,
-    }, _dqn_notes("SB3", lacks | _lacking_in_both(values))
+        "exploration_final_eps": final,
+    }, notes
 
 
 def _rllib_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
@@ -230,7 +269,20 @@ def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
         }
     # The default is too little to be missed.
     adds = values.prioritized_epsilon != DQNHyperparams.model_fields["prioritized_epsilon"].default
-    lacks = {"replay none": values.replay == "none", "prioritized_epsilon": values.replay == "prioritized" and adds}
+    lacks = {
+        "replay none": values.replay == "none",
+        "prioritized_epsilon": values.replay == "prioritized" and adds,
+        "optimizer rmsprop": values.optimizer == "rmsprop",
+    }
+    notes = _dqn_notes("RLlib", lacks | _lacking_in_both(values))
+    changed = [name for name, default in _TORCHS_ADAM.items() if getattr(values, name) != default]
+    if values.optimizer == "adam" and changed:
+        # The new API stack doesn't read adam_epsilon.
+        are = "is" if len(changed) == 1 else "are"
+        notes.append(f"{', '.join(changed)} {are} left out: RLlib makes Adam with torch's defaults.")
+    phase = rllib_phase(values)
+    target_update_freq, target_notes = rllib_target(values, phase)
+    start, initial = values.epsilon_start, values.epsilon_initial
     decay = max(1, round(values.epsilon_decay))
     return {
         "train_batch_size_per_learner": values.train_batch_size,
@@ -239,19 +291,17 @@ def _rllib_dqn(values: DQNHyperparams) -> tuple[dict[str, Any], list[str]]:
         "dueling": values.dueling,
         "n_step": values.n_step,
         "td_error_loss_fn": values.td_loss,
-        "adam_epsilon": values.optimizer_epsilon,
         "tau": values.tau,
-        "target_network_update_freq": values.target_update_interval or 1,
+        "target_network_update_freq": target_update_freq,
         "num_steps_sampled_before_learning_starts": values.learning_starts,
-        "epsilon": [[0, values.epsilon_initial], [decay, values.epsilon_final]],
+        "epsilon": [[0, initial], *([[start, initial]] if start else []), [start + decay, values.epsilon_final]],
         "replay_buffer_config": replay,
-    }, _dqn_notes("RLlib", lacks | _lacking_in_both(values))
+    }, [*notes, *phase.notes, *target_notes]
 
 
 def _lacking_in_both(values: DQNHyperparams) -> dict[str, bool]:
     """Return what neither library's DQN has, by its name, with whether the values ask for it."""
     return {
-        "optimizer rmsprop": values.optimizer == "rmsprop",
         "target_network false": not values.target_network,
         "the schedule of epsilon": values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step",
         "updates of the target by episodes": values.target_update_unit == "episode",

@@ -1,0 +1,91 @@
+"""The written programs for RLlib configure it as ours trains."""
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+from policies.foreign_code import rllib_program
+from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.networks.epsilon import EpsilonSchedule
+
+pytestmark = pytest.mark.ray
+
+
+def names_of(values: TrainedHyperparams, *, builds: bool = False) -> dict[str, Any]:
+    code = rllib_program(values, env_id="CartPole-v1", env_args={}).code
+    names: dict[str, Any] = {}
+    # The last line builds.
+    exec(code if builds else code.rsplit("\n", 1)[0], names)
+    return names
+
+
+def config_of(values: TrainedHyperparams) -> Any:
+    config = names_of(values)["config"]
+    config.validate()
+    return config
+
+
+@pytest.mark.parametrize("hyperparams", [PPOHyperparams, DQNHyperparams])
+@pytest.mark.parametrize("grad_clip", [None, 0.5])
+def test_gradients_are_clipped_as_ours(hyperparams: Any, grad_clip: float | None) -> None:
+    assert config_of(hyperparams(grad_clip=grad_clip)).grad_clip == grad_clip
+
+
+@pytest.mark.parametrize("start", [0, 300])
+def test_epsilon_moves_as_ours(start: int) -> None:
+    from ray.rllib.utils.schedules.scheduler import Scheduler
+
+    values = DQNHyperparams(epsilon_start=start, epsilon_decay=200)
+    scheduler = Scheduler(fixed_value_or_schedule=config_of(values).epsilon, framework="torch")
+    ours = EpsilonSchedule.of(values)
+    for now in (0, 150, 299, 400, 1_000):
+        assert scheduler.update(timestep=now) == pytest.approx(ours.at(now))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, (4, [1, 1])),
+        ({"updates_per_env_step": 0.1}, (10, [1, 1])),
+        ({"updates_per_env_step": 0.01, "num_envs": 8}, (25, [1, 2])),
+        ({"train_freq": 10, "num_envs": 4}, (3, [1, 3])),
+        ({"n_step": 5}, (8, [1, 2])),
+        ({"updates_per_env_step": 0.0837}, (12, [1, 1])),
+    ],
+)
+def test_updates_are_as_many_as_ours(changes: dict[str, Any], expected: tuple[int, list[int]]) -> None:
+    from ray.rllib.algorithms.dqn.dqn import calculate_rr_weights
+
+    config = config_of(DQNHyperparams(**changes))
+    assert (config.get_rollout_fragment_length(), calculate_rr_weights(config)) == expected
+
+
+@pytest.mark.parametrize("values", [PPOHyperparams(activation="tanh"), DQNHyperparams(activation="elu", dueling=False)])
+def test_layers_after_convolutions_are_ours(values: TrainedHyperparams) -> None:
+    values = values.model_copy(update={"conv_filters": ((4, 3, 2), (8, 3, 2)), "hidden_sizes": (24,)})
+    spaces: tuple[gym.Space[Any], ...] = gym.spaces.Box(0, 1, (16, 16, 3)), gym.spaces.Discrete(2)
+    spec = config_of(values).get_rl_module_spec(spaces={"default_policy": spaces})
+    layers = [type(layer).__name__ for layer in spec.build().modules()]
+    # PPO has a policy and a value function; DQN's target network is made later, by the learner.
+    name, num_networks = ("Tanh", 2) if isinstance(values, PPOHyperparams) else ("ELU", 1)
+    assert layers.count(name) == 3 * num_networks
+    assert "ReLU" not in layers
+
+
+def test_soft_target_updates_follow_every_update_and_adam_is_torchs() -> None:
+    from ray.rllib.utils.metrics import NUM_TARGET_UPDATES
+
+    values = DQNHyperparams(
+        hidden_sizes=(4,), tau=0.1, train_freq=100, updates_per_env_step=0.1, learning_starts=0, optimizer_epsilon=1e-3
+    )
+    algorithm = names_of(values, builds=True)["algorithm"]
+    try:
+        result = algorithm.train()
+        optimizer = algorithm.learner_group._learner.get_optimizer("default_policy")
+    finally:
+        algorithm.stop()
+    num_env_steps = result["num_env_steps_sampled_lifetime"]
+    assert result["learners"]["default_policy"][NUM_TARGET_UPDATES] == num_env_steps * 0.1
+    # The note on what is left out says so.
+    assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-8, (0.9, 0.999))

@@ -1,0 +1,191 @@
+"""The written programs for Stable-Baselines3 train as ours do, or a note says in what they don't."""
+
+import math
+from typing import Any
+
+import pytest
+
+from policies.foreign_code import ForeignProgram, rllib_program, stable_baselines3_program
+from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.networks.epsilon import EpsilonSchedule
+
+SMALL: dict[str, Any] = {"hidden_sizes": (4,), "learning_starts": 0, "train_batch_size": 1}
+LATE = {"epsilon_start": 100, "epsilon_decay": 200.0}
+
+
+def for_sb3(values: TrainedHyperparams, num_env_steps: int = 10_000) -> ForeignProgram:
+    return stable_baselines3_program(values, env_id="CartPole-v1", env_args={}, num_env_steps=num_env_steps)
+
+
+def for_rllib(**changes: Any) -> ForeignProgram:
+    return rllib_program(DQNHyperparams(**changes), env_id="CartPole-v1", env_args={})
+
+
+def sb3_model(values: TrainedHyperparams, num_env_steps: int = 10_000, *, trains: bool = True) -> Any:
+    pytest.importorskip("stable_baselines3")
+    code = for_sb3(values, num_env_steps).code
+    names: dict[str, Any] = {}
+    # The last line trains.
+    exec(code if trains else code.rsplit("\n", 1)[0], names)
+    return names["model"]
+
+
+# -- updates
+
+
+@pytest.mark.parametrize(
+    ("train_freq", "num_envs", "updates_per_env_step", "phase"),
+    [
+        (4, 1, 0.25, (4, 1)), (4, 1, 0.1, (10, 1)), (4, 8, 0.01, (25, 2)), (10, 4, 0.25, (3, 3)), (4, 1, 0.4, (5, 2)),
+        (1, 4, 2.0, (1, 8)), (2, 1, 0.00125, (800, 1)),
+    ],
+)  # fmt: skip
+def test_sb3_makes_as_many_updates(
+    train_freq: int, num_envs: int, updates_per_env_step: float, phase: tuple[int, int]
+) -> None:
+    values = DQNHyperparams(
+        **SMALL, train_freq=train_freq, num_envs=num_envs, updates_per_env_step=updates_per_env_step
+    )
+    model = sb3_model(values, 400)
+    assert (model.train_freq.frequency, model.gradient_steps) == phase
+    phases = math.ceil(400 / (phase[0] * num_envs))
+    # As many as ours, rounded up to whole phases.
+    assert model._n_updates == phases * phase[1]
+    assert model._n_updates == pytest.approx(phases * phase[0] * num_envs * updates_per_env_step, rel=0.01)
+
+
+@pytest.mark.parametrize("updates_per_env_step", [1e-7, 0.0837, 0.3, 0.77, 3.21])
+def test_a_rate_of_updates_is_kept_and_a_note_tells_of_other_phases(updates_per_env_step: float) -> None:
+    values = DQNHyperparams(updates_per_env_step=updates_per_env_step)
+    names: dict[str, Any] = {}
+    program = for_sb3(values)
+    for line in program.code.splitlines():
+        if "train_freq" in line or "gradient_steps" in line:
+            exec(line.strip(" ,"), names)
+    assert names["train_freq"] >= 4
+    assert names["gradient_steps"] / names["train_freq"] == pytest.approx(updates_per_env_step, rel=0.01)
+    found = [note for note in program.notes if note.startswith("Updates in a training phase: ")]
+    assert found == [note for note in for_rllib(updates_per_env_step=updates_per_env_step).notes if "phase: " in note]
+    assert len(found) == 1
+
+
+def test_phases_that_are_ours_have_no_note() -> None:
+    values = DQNHyperparams(double_q=False, dueling=False, learning_starts=0)
+    assert for_sb3(values).notes == ()
+    note = "Updates in a training phase: 1 every 10 env steps, ours 0.4 on average every 4."
+    assert note in for_sb3(values.model_copy(update={"updates_per_env_step": 0.1})).notes
+
+
+# -- target updates
+
+
+@pytest.mark.parametrize("updates_per_env_step", [0.25, 1.0, 4.0])
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_sb3s_soft_target_moves_as_far_as_ours(
+    updates_per_env_step: float, num_envs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = DQNHyperparams(**SMALL, tau=0.05, num_envs=num_envs, updates_per_env_step=updates_per_env_step)
+    dqn = pytest.importorskip("stable_baselines3.dqn.dqn")
+    taus: list[float] = []
+    monkeypatch.setattr(dqn, "polyak_update", lambda _, __, tau: taus.append(tau))
+    model = sb3_model(values, 80)
+    # Each move is followed by one of running statistics, of which there are none.
+    kept = math.prod(1 - tau for tau in taus[::2])
+    assert kept == pytest.approx((1 - 0.05) ** model._n_updates)
+    moves_in_it = updates_per_env_step * max(4, num_envs) > 1
+    assert any("target network is updated once" in note for note in for_sb3(values).notes) is moves_in_it
+
+
+@pytest.mark.parametrize(
+    ("changes", "interval", "note"),
+    [
+        ({}, 500, ""),
+        ({"num_envs": 8}, 496, ""),
+        ({"target_update_freq": 10, "train_freq": 1, "updates_per_env_step": 1.0}, 10, ""),
+        # Ours is updated after an update, of which there is one in four env steps.
+        ({"target_update_freq": 10}, 12, ""),
+        ({"target_update_freq": 20, "num_envs": 8}, 16, "every 16 env steps, ours every 20."),
+        (
+            {"target_update_freq": 100, "train_freq": 1000, "updates_per_env_step": 1.0},
+            1000,
+            "once for each training phase, not 10 times in it.",
+        ),
+        ({"target_update_freq": 100, "train_freq": 1000, "target_update_unit": "episode"}, 1000, ""),
+    ],
+)
+def test_sb3s_target_is_updated_as_often(changes: dict[str, Any], interval: int, note: str) -> None:
+    program = for_sb3(DQNHyperparams(**changes))
+    assert f"    target_update_interval={interval},\n" in program.code
+    found = [text.removeprefix("The target network is updated ") for text in program.notes if "target network" in text]
+    assert found == ([note] if note else [])
+
+
+# -- exploration
+
+
+@pytest.mark.parametrize("changes", [{"epsilon_decay": 1000.0}, {"epsilon_decay": 100.0}, LATE, {"epsilon_start": 500}])
+def test_sb3s_epsilon_ends_where_ours_does(changes: dict[str, Any]) -> None:
+    values = DQNHyperparams(**SMALL, **changes)
+    model = sb3_model(values, 250)
+    epsilon = EpsilonSchedule.of(values)
+    assert model.exploration_rate == pytest.approx(epsilon.at(model.num_timesteps), abs=0.02)
+    if "epsilon_start" not in changes:
+        assert model.exploration_schedule(0.8) == pytest.approx(epsilon.at(50))
+    assert any("epsilon_start is left out" in note for note in for_sb3(values).notes) is ("epsilon_start" in changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_told"), [({}, True), ({"learning_starts": 0}, False), ({"epsilon_start": 1000}, False)]
+)
+def test_random_actions_before_learning_are_told(changes: dict[str, Any], is_told: bool) -> None:
+    notes = for_sb3(DQNHyperparams(**changes)).notes
+    assert ("SB3's actions are all random until learning_starts, ours as epsilon says." in notes) is is_told
+
+
+# -- optimizers
+
+
+def test_sb3s_optimizer_is_ours() -> None:
+    def defaults(values: TrainedHyperparams) -> tuple[str, dict[str, Any]]:
+        optimizer = sb3_model(values, trains=False).policy.optimizer
+        return type(optimizer).__name__, optimizer.defaults
+
+    name, found = defaults(PPOHyperparams())
+    assert (name, found["eps"], found["betas"]) == ("Adam", 1e-8, (0.9, 0.999))
+    name, found = defaults(DQNHyperparams(optimizer_epsilon=1e-3, adam_beta1=0.8, adam_beta2=0.99))
+    assert (name, found["eps"], found["betas"]) == ("Adam", 1e-3, (0.8, 0.99))
+    values = DQNHyperparams(optimizer="rmsprop", optimizer_epsilon=1e-3, rmsprop_rho=0.95, rmsprop_momentum=0.5)
+    name, found = defaults(values)
+    assert (name, found["eps"], found["alpha"], found["momentum"]) == ("RMSprop", 1e-3, 0.95, 0.5)
+    assert not any("rmsprop" in note for note in for_sb3(values).notes)
+
+
+def test_what_rllibs_optimizer_lacks_is_told() -> None:
+    told = "left out: RLlib makes Adam with torch's defaults."
+    assert for_rllib(optimizer_epsilon=1e-3).notes == (f"optimizer_epsilon is {told}",)
+    assert for_rllib(adam_beta1=0.8, adam_beta2=0.99).notes == (f"adam_beta1, adam_beta2 are {told}",)
+    assert for_rllib(optimizer="rmsprop", adam_beta1=0.8).notes == ("RLlib's DQN lacks optimizer rmsprop.",)
+
+
+def test_dense_layers_that_rllibs_heads_do_not_share_are_told() -> None:
+    told = "Each head has hidden_sizes of its own: RLlib's heads share the convolutions alone."
+    filters = {"conv_filters": ((4, 3, 2),)}
+    assert told in for_rllib(**filters).notes
+    assert told not in for_rllib(**filters, dueling=False).notes
+    for shares in (False, True):
+        values = PPOHyperparams(**filters, vf_share_layers=shares)
+        assert (told in rllib_program(values, env_id="E", env_args={}).notes) is shares
+
+
+# -- RLlib's target updates, which are looked at after each update
+
+
+def test_rllibs_target_updates_that_are_not_ours_are_told() -> None:
+    assert for_rllib(tau=0.1, updates_per_env_step=1.0).notes == ()
+    assert for_rllib(target_update_freq=2_000, train_freq=1_000).notes == ()
+    assert for_rllib(target_update_freq=100, train_freq=1_000).notes == (
+        "The target network is updated once in each training phase, not 10 times.",
+    )
+    assert for_rllib(target_update_freq=1_500, train_freq=1_000).notes == (
+        "The target network is updated every 2000 env steps, ours every 1500.",
+    )
