@@ -92,6 +92,22 @@ def test_a_wrong_point_is_refused_with_its_place(points: Any, words: list[str]) 
     assert "lr (loguniform" in caught.value.hint
 
 
+def test_a_point_that_the_grid_has_too_is_told_in_whatever_form_it_is_given() -> None:
+    space: dict[str, Any] = {"lr": {"grid": [1e-3, 1e-2]}, "hidden_sizes": {"grid": [[32], [64]]}}
+    points = [{"lr": 1e-2, "hidden_sizes": 32}, {"lr": 1e-2, "hidden_sizes": 16}]
+
+    def told(points: list[dict[str, Any]], **changes: Any) -> list[str]:
+        plan = make_plan(make_spec(points, space=space, num_samples=1, **changes), MACHINE)
+        return [note for note in plan.notes if "the same values" in note or "more chosen" in note]
+
+    (note,) = told(points)
+    assert note.startswith("Point 0 was chosen, and point 4 has the same values: each counts as a setting of its own")
+    assert told(points[1:]) == []
+    space["hidden_sizes"]["grid"] = [[size] for size in range(1, 8)]
+    many = told([{"lr": 1e-3, "hidden_sizes": size} for size in range(1, 8)])
+    assert many[5:] == ["So it is with 2 more chosen points."]
+
+
 @pytest.mark.parametrize("points", [{"lr": 1e-3}, 3, "lr=1", [None], [[1]], [3]])
 def test_what_is_no_list_of_points_is_refused(points: Any) -> None:
     with pytest.raises(SpecError, match=r"points"):

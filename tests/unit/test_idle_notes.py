@@ -83,6 +83,19 @@ def test_a_search_that_changes_nothing_is_refused(name: str) -> None:
         notes(**fields, space={**space, **grid(activation=["relu", "tanh"])})
 
 
+@pytest.mark.parametrize("named", [[32, 64], 64, 64.0])
+@pytest.mark.parametrize("batch", [{"power_of_two": [16, 256]}, {"qrandint": [16, 256, 16]}])
+def test_what_acts_only_with_a_value_inside_a_range_is_not_refused(batch: dict[str, Any], named: Any) -> None:
+    optimizer = {"choice": ["adam", "rmsprop"], "when": {"train_batch_size": named}}
+    space = {"train_batch_size": batch, "optimizer": optimizer, "rmsprop_rho": {"uniform": [0.9, 0.99]}}
+    told = "\n".join(notes(**DQN, num_samples=20, space=space))
+    assert "space.rmsprop_rho can't act: " not in told
+    # Where no value of it would do, it is refused as ever.
+    space["optimizer"] = {**optimizer, "choice": ["adam"]}
+    with pytest.raises(SpecError, match=r"rmsprop_rho is searched, but can't act"):
+        notes(**DQN, num_samples=20, space=space)
+
+
 def test_several_are_told_at_once() -> None:
     space = grid(kl_target=[0.01, 0.1], kl_coeff=[0.1, 0.2], lr=[1e-3, 1e-4])
     with pytest.raises(SpecError, match=r"space\.kl_target, space\.kl_coeff are searched") as refused:

@@ -188,7 +188,7 @@ LAYERS = {"layers": {"number": [1, 2], "sizes": {"choice": [8]}}}
     [
         ({"power_of_two": [16, 1024]}, [64, 128], {"power_of_two": [32, 256]}),
         ({"power_of_two": [16, 64]}, [16], {"power_of_two": [16, 32]}),
-        ({"one_minus_loguniform": [0.9, 0.9999]}, [0.99, 0.99], {"one_minus_loguniform": [0.9763, 0.995]}),
+        ({"one_minus_loguniform": [0.9, 0.9999]}, [0.99, 0.99], {"one_minus_loguniform": [0.9762, 0.995]}),
         (LAYERS, [[8]], LAYERS),
     ],
 )
@@ -205,6 +205,6 @@ def test_domains_in_words() -> None:
 
 def test_what_is_nearly_one_is_not_called_one() -> None:
     assert [short_text(value) for value in (0.9999, 0.99987, 0.9994, 1.0, 1.00001)] == [
-        "0.9999", "0.99987", "0.999", "1", "1",
+        "0.9999", "0.99987", "0.9994", "1", "1",
     ]  # fmt: skip
     assert (setting_text(0.99996), number(0.99996)) == ("0.99996", "0.99996")

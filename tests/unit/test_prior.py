@@ -157,6 +157,40 @@ def test_a_name_that_was_fixed_there_has_that_value(tmp_path: Path) -> None:
     assert {item.point["gamma"] for item in prior.points} == {0.95}
 
 
+LAYERS = {"layers": {"number": 1, "sizes": [64, 128]}}
+
+
+@pytest.mark.parametrize(
+    ("there", "name", "domain", "expected"),
+    [
+        ({"hyperparams": {"hidden_sizes": 64}}, "hidden_sizes", {"choice": [[64], [128]]}, [[64]]),
+        ({"hyperparams": {"hidden_sizes": 64}}, "hidden_sizes", {"choice": [64, 128]}, [64]),
+        ({"hyperparams": {"hidden_sizes": 64}}, "hidden_sizes", LAYERS, [[64]]),
+        ({"space": {"hidden_sizes": {"choice": [64, 128]}}}, "hidden_sizes", {"choice": [[64], [128]]}, [[64], [128]]),
+        ({"space": {"hidden_sizes": {"choice": [64, 128, 32]}}}, "hidden_sizes", LAYERS, [[64], [128]]),
+        ({"hyperparams": {"gae_lambda": 1}}, "gae_lambda", {"choice": [1.0, 0.9]}, [1.0]),
+        ({"space": {"train_batch_size": {"choice": [1024.0, 2048.0]}}}, "train_batch_size",
+         {"choice": [1024, 2048]}, [1024, 2048]),
+        ({"space": {"train_batch_size": {"choice": [1024.0, 2048.0]}}}, "train_batch_size",
+         {"power_of_two": [512, 1024]}, [1024]),
+        ({"space": {"num_epochs": {"quniform": [1, 2, 1]}}}, "num_epochs", {"choice": [1, 2]}, [1, 2]),
+    ],
+)  # fmt: skip
+def test_a_value_that_is_written_in_another_form_there_is_the_same(
+    there: dict[str, Any], name: str, domain: dict[str, Any], expected: list[Any], tmp_path: Path
+) -> None:
+    write_earlier(tmp_path, **{**there, "space": {**SPACE, **there.get("space", {})}})
+    _, (prior,) = begun(tmp_path, space={**SPACE, name: domain})
+    found = {json.dumps(item.point[name]) for item in prior.points}
+    assert found == set(map(json.dumps, expected))
+
+
+def test_a_value_that_the_hyperparameter_or_its_range_cannot_have_is_outside(tmp_path: Path) -> None:
+    write_earlier(tmp_path, space={**SPACE, "grad_clip": {"choice": [None, 0.5, 1]}})
+    _, (prior,) = begun(tmp_path, space={**SPACE, "grad_clip": {"uniform": [0.1, 1.0]}})
+    assert {repr(item.point["grad_clip"]) for item in prior.points} == {"0.5", "1.0"}
+
+
 def test_a_point_has_what_acts_in_the_new_space_and_one_that_lacks_some_of_it_is_left_out(tmp_path: Path) -> None:
     replay = {"choice": ["uniform", "prioritized"]}
     alpha = {"uniform": [0.1, 0.9]}

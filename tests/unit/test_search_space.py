@@ -96,7 +96,7 @@ def test_the_log_form_favours_small_values() -> None:
         ({"qrandint": [11, 19, 10]}, "no multiple of 10 between 11 and 19"),
         ({"uniform": [0, float("inf")]}, "finite"),
         ({"uniform": [0, "1"]}, "'1' is not a number"),
-        ({"uniform": [False, 1]}, "False is not a number"),
+        ({"uniform": [False, 1]}, "false is not a number"),
         ({"randint": [0, 1.5]}, "1.5"),
         ({"uniform": [1]}, "Field required"),
         ({"uniform": [1, 2, 3]}, "at most 2 items"),

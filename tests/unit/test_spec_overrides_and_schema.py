@@ -94,6 +94,44 @@ def test_a_problem_says_that_it_came_from_set() -> None:
     assert any(line.strip().startswith("seed:") and line.endswith("(from --set)") for line in lines)
 
 
+def test_a_searched_length_of_training_is_named_anywhere_in_the_space() -> None:
+    lengths: dict[str, Any] = {"stop.num_env_steps": {"choice": [50_000, 60_000]}}
+    spec = load_spec(MINIMAL, ["space.stop.num_env_steps.choice=[3000, 4000]"])
+    assert cast("Any", spec.space["stop.num_env_steps"]).values == (3000, 4000)
+    assert spec.stop.num_env_steps == 4000
+    space = {**lengths, "lr": {"uniform": [0.1, 0.2]}}
+    spec = load_spec({**MINIMAL, "space": space}, ["space.lr.when.stop.num_env_steps=50000"])
+    assert spec.space["lr"].when == {"stop.num_env_steps": 50_000}
+    space["lr"] = {"uniform": [0.1, 0.2], "when": {"stop.num_env_steps": 50_000, "num_epochs": 2}}
+    space["num_epochs"] = {"choice": [1, 2]}
+    spec = load_spec({**MINIMAL, "space": space}, ["space.lr.when.stop.num_env_steps="])
+    assert spec.space["lr"].when == {"num_epochs": 2}
+    spec = load_spec(MINIMAL, ["space.stop.num_env_steps.grid=[10_000]", "space.stop.num_env_steps="])
+    assert spec.space == {}
+    message = errors(overrides=["space.stop.num_env_steps.randint=[5, 3]"])
+    assert "space.stop.num_env_steps.randint: goes from 5 to 3" in message
+    assert "(from --set)" in message
+
+
+def test_a_cost_is_set_beside_the_name_that_a_file_may_give_the_score() -> None:
+    spec = load_spec({**MINIMAL, "objective": "return"}, ["objective.cost=env_steps"])
+    assert spec.objective == load_spec({**MINIMAL, "objective": ["return", "env_steps"]}).objective
+    assert load_spec({**MINIMAL, "objective": {"type": "return"}}).objective.type == "final"
+    assert "objective.type: ['x'] is not allowed" in errors(objective={"type": ["x"]})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["space.lr.loguniform=[1e-4, 1e-2]"], "and has uniform and loguniform"),
+        ([f"space.lr.{name}=1" for name in "abcde"], "and has uniform and a and b and c and more"),
+        (["space.lr={}"], "and has none"),
+    ],
+)
+def test_a_domain_of_several_kinds_is_told_with_their_names(overrides: list[str], told: str) -> None:
+    assert told in errors(space={"lr": {"uniform": [1e-4, 1e-2]}}, overrides=overrides)
+
+
 def test_overrides_leave_the_mapping_they_were_given_alone() -> None:
     source = {**MINIMAL, "stop": {"num_env_steps": 10}}
     load_spec(source, ["stop.num_env_steps=20"])
@@ -128,6 +166,37 @@ def test_the_schema_accepts_presets_and_refuses_what_is_wrong() -> None:
     ]
     for wrong in bad:
         assert list(validator.iter_errors(wrong)), wrong
+
+
+SPACE: dict[str, Any] = {"lr": {"uniform": [0.1, 0.2]}}
+
+
+@pytest.mark.parametrize(
+    ("data", "is_right"),
+    [
+        ({"prior": "acrobot", "search": "gp", "space": SPACE}, True),
+        ({"prior": ["acrobot", "pendulum"], "search": "gp", "space": SPACE}, True),
+        ({"prior": "", "search": "gp"}, False),
+        ({"prior": 3, "search": "gp"}, False),
+        ({"space": {"hidden_sizes": {"layers": {"number": 2, "sizes": [32, 64]}}}}, True),
+        ({"space": {"hidden_sizes": {"layers": {"number": 2.0, "sizes": [32, 64]}}}}, True),
+        ({"space": {"hidden_sizes": {"layers": {"number": [1, 2.0], "sizes": [32, 64]}}}}, True),
+        ({"space": {"hidden_sizes": {"layers": {"number": "2", "sizes": [32, 64]}}}}, False),
+        ({"space": {"hidden_sizes": {"layers": {"number": 2.5, "sizes": [32, 64]}}}}, False),
+        ({"space": {"hidden_sizes": {"layers": {"number": True, "sizes": [32, 64]}}}}, False),
+        ({"objective": {"type": "return", "cost": "env_steps"}}, True),
+        ({"objective": {"type": "score", "cost": "env_steps"}}, False),
+    ],
+)
+def test_the_schema_and_the_model_take_the_forms_that_a_field_may_have(data: dict[str, Any], *, is_right: bool) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    validator = jsonschema.Draft202012Validator(json_schema())
+    whole = {**MINIMAL, "num_samples": 12, **data}
+    assert validator.is_valid(whole) == is_right
+    if is_right:
+        load_spec(whole)
+    else:
+        errors(**data)
 
 
 VALUES: list[Any] = [

@@ -21,7 +21,7 @@ from policies.errors import SpecError
 from policies.hyperparams import DQNHyperparams, Hyperparams
 from policies.idle.find import NO_UPDATE, RULES, Limits, Rule, idle_rule
 from tune_jobs.plan.estimates import max_env_steps, max_iterations
-from tune_jobs.spec.conditions import Conditions
+from tune_jobs.spec.conditions import Conditions, named_values
 from tune_jobs.spec.domains import Domain, Grid, Layers, Listed, Range
 from tune_jobs.spec.training_length import as_trained
 
@@ -143,6 +143,15 @@ def _values_of(domain: Domain) -> list[Any]:
     return ends if low < high else ends[:1]
 
 
+def _named(space: Mapping[str, Domain], name: str) -> list[Any]:
+    """Return the values of a range that conditions name, as they may hold with no value between its ends but those."""
+    domain = space[name]
+    if not isinstance(domain, Range):
+        return []
+    given = [other.when[name] for other in space.values() if other.when and name in other.when]
+    return [domain.of_code(domain.code_of(value)) for each in given for value in named_values(domain, each)]
+
+
 def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_search: bool) -> str | None:
     """Return why no value of a hyperparameter acts, whatever values the others have; None if one may act.
 
@@ -158,7 +167,8 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
     rules = [rule for rule in RULES[spec.algorithm][name] if is_search or not (rule.of_value or rule is NO_UPDATE)]
     reads = {read for rule in rules for read in rule.reads if read in spec.space}
     related = {other: spec.space[other] for other in spec.space if other in _with_conditions_of(spec, reads | {name})}
-    others = {read: _values_of(domain) for read, domain in related.items() if read != name}
+    others = {read: _values_of(domain) + _named(related, read) for read, domain in related.items() if read != name}
+    others = {read: list({json.dumps(value): value for value in values}.values()) for read, values in others.items()}
     if not rules or math.prod(map(len, others.values())) * len(own) > _MOST_COMBINATIONS:
         return None
     base, conditions = points.known[0][1], Conditions(related)
@@ -178,7 +188,7 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
             return None
         for rule, reason in filter(None, found):
             why.setdefault(rule, reason)
-    # Of a range the ends alone were tried, with which a condition may not hold.
+    # Without a reason there were no values with which it acts.
     return "; or ".join(why.values()) or None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,8 +14,8 @@ from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, PPOHyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.plan.estimates import iteration_env_steps
-from tune_jobs.spec.domains import Listed
-from tune_jobs.spec.draws import num_points
+from tune_jobs.spec.domains import Domain, Grid, Listed
+from tune_jobs.spec.draws import draw_points, num_points
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.training_length import hyperparams_in
@@ -42,13 +41,28 @@ def repeated_points_notes(spec: SweepSpec) -> list[str]:
     ):
         repeats = f"The space has no random domain, so num_samples {spec.num_samples} repeats every point"
         return [f"{repeats}; seeds_per_point does that and averages over the seeds."]
-    listed = [domain for domain in spec.space.values() if isinstance(domain, Listed)]
-    num_different, num_tried = math.prod(len(domain.values) for domain in listed), num_points_of(spec)
-    if len(listed) < len(spec.space) or num_different >= num_tried or spec.scheduler.is_population:
+    if spec.scheduler.is_population:
         return []
-    different = counted(num_different, "different point")
-    repeats = f"The space has {different}, so some of the {num_tried} that num_samples gives are the same"
-    return [f"{repeats}; seeds_per_point trains each again, and averages over the seeds."]
+    again = "; seeds_per_point trains each again, and averages over the seeds."
+    num_different, num_tried = _num_different(spec.space), num_points_of(spec)
+    if num_different is not None and num_different < num_tried:
+        different = counted(num_different, "different point")
+        return [f"The space has {different}, so some of the {num_tried} that num_samples gives are the same{again}"]
+    if spec.search.type != "random" or spec.num_samples == 1 or not any(item.when for item in spec.space.values()):
+        return []
+    # What is random depends on grids in the end, so that it acts with all samples of their combination, or with none.
+    combinations = draw_points(spec.space, 1, spec.seed)
+    fixed = sum(not any(spec.space[name].is_random for name in point) for point in combinations)
+    without = f"No random domain acts in {fixed:,} of the {counted(len(combinations), 'combination')} of grids"
+    return [f"{without}, so num_samples {spec.num_samples} repeats what has them{again}"] if fixed else []
+
+
+def _num_different(space: Mapping[str, Domain]) -> int | None:
+    """Return the number of different points of a space, up to a million or somewhat more; None: it has ranges."""
+    listed = {name: domain for name, domain in space.items() if isinstance(domain, Listed)}
+    if len(listed) < len(space):
+        return None
+    return num_points({name: Grid(grid=domain.values, when=domain.when) for name, domain in listed.items()}, 1)
 
 
 def num_trials_of(

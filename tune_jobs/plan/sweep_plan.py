@@ -43,10 +43,11 @@ from tune_jobs.plan.points import (
 )
 from tune_jobs.plan.user_code import check_rl_module
 from tune_jobs.search.chosen_point import outside_notes
-from tune_jobs.search.given_points import given_points
+from tune_jobs.search.given_points import given_points, repeated_notes
 from tune_jobs.search.points import largest_hyperparams, planned_points
 from tune_jobs.search.prior import prior_notes
 from tune_jobs.search.proposal import check_installed
+from tune_jobs.spec.draws import MOST_COMBINATIONS
 from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.hyperparam_problems import check_distinct
 from tune_jobs.spec.rules import idle_settings
@@ -229,6 +230,7 @@ def make_plan(
             *engine_notes,
             *memory_notes,
             *outside_notes(spec, chosen_points),
+            *repeated_notes(chosen_points, searched),
             *prior_notes(spec, prior),
         ),
         packs=packs,
@@ -242,8 +244,11 @@ def _num_trials(
     """Return the number of trials to be planned; too many are refused."""
     number = num_trials_of(spec, replications, chosen_points)
     if number > MAX_TRIALS:
+        # With conditions, combinations are counted up to a million and somewhat beyond.
+        is_counted = number <= MOST_COMBINATIONS or not any(domain.when for domain in spec.space.values())
+        told = f"{number:,}" if is_counted else f"more than {MOST_COMBINATIONS:,}"
         raise SpecError(
-            f"The sweep has {number:,} trials; at most {MAX_TRIALS:,} can be planned.",
+            f"The sweep has {told} trials; at most {MAX_TRIALS:,} can be planned.",
             "Lower num_samples or seeds_per_point, or make the grids smaller.",
         )
     return number

@@ -16,7 +16,7 @@ from policies.suggestions import did_you_mean
 from tune_jobs.spec.conditions import Conditions, needed_text
 from tune_jobs.spec.domains import Domain, Layers, Listed, Range
 from tune_jobs.spec.hyperparam_problems import in_one_form, value_problems
-from tune_jobs.spec.plain_data import to_plain
+from tune_jobs.spec.plain_data import to_plain, yaml_text
 from tune_jobs.spec.rules import check_takes_points
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -44,7 +44,7 @@ def checked_point(spec: SweepSpec, given: Mapping[str, Any], *, place: str = "po
             if found := _problems(spec, name, domain, values[name]):
                 wrong += found
             else:
-                point[name] = _written(spec, name, domain, values[name])
+                point[name] = as_written(spec, name, domain, values[name])
     problems += [*_missing(spec.space, values | point), *wrong]
     if not problems:
         problems = _idle(spec.space, point)
@@ -82,15 +82,26 @@ def _problems(spec: SweepSpec, name: str, domain: Domain, value: Any) -> list[st
     # Elsewhere values of a range are numbers: on axes, in models of what mattered.
     if isinstance(domain, Range) and not (is_number(value) and (not domain.is_whole or float(value).is_integer())):
         kind = "whole number" if domain.is_whole else "number"
-        return [f"{name}: {shortened(value)} is not a {kind}, and its domain is {domain_text(domain)}"]
+        return [f"{name}: {yaml_text(value)} is not a {kind}, and its domain is {domain_text(domain)}"]
     path = f"point.{name}"
     found = value_problems(spec.algorithm, name, value, path=path)
     return [f"{problem.path.removeprefix('point.')}: {problem.text}" for problem in found]
 
 
-def _written(spec: SweepSpec, name: str, domain: Domain, value: Any) -> Any:
+def as_written(spec: SweepSpec, name: str, domain: Domain, value: Any) -> Any:
+    """Return a value of a hyperparameter in the form in which its domain gives it; it may lie outside of the domain.
+
+    Args:
+        spec: The sweep.
+        name: The hyperparameter's name.
+        domain: Its domain.
+        value: A value that the hyperparameter takes; of a range, a number.
+
+    Raises:
+        pydantic.ValidationError: The hyperparameter does not take the value.
+    """
     if isinstance(domain, Range):
-        return int(value) if domain.is_whole else float(value)
+        return int(value) if domain.is_whole and float(value).is_integer() else float(value)
     if isinstance(domain, Layers):
         return [int(size) for size in as_sizes(value)]
     assert isinstance(domain, Listed)

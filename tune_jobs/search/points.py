@@ -10,17 +10,22 @@ from typing import Any
 from analysis.numbering import with_chosen
 from analysis.records import ChosenPointRecord
 from policies.errors import SpecError
-from policies.hyperparams import Hyperparams, as_sizes
+from policies.hyperparams import Hyperparams
 from tune_jobs.spec.domains import Domain, Layers, Listed, Range
 from tune_jobs.spec.draws import draw_point, draw_points
+from tune_jobs.spec.hyperparam_problems import as_taken
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _MAX_COMBINATIONS = 10_000
 _DECIDE_SIZE = (
     "num_envs", "train_batch_size", "env_steps_per_iteration", "hidden_sizes", "conv_filters", "vf_share_layers",
-    "replay_capacity",
+    "replay_capacity", "minibatch_size", "train_freq", "replay",
 )  # fmt: skip
 """The hyperparameters that a trial's env steps, disk space and memory depend on."""
+_GREATEST_IS_LARGEST = ("minibatch_size", "train_freq")
+"""Those of which the greatest value alone is needed, as estimates only grow with it."""
+_REPLAYS = ("none", "uniform", "prioritized")
+"""Kinds of replay memory, the smallest first."""
 
 
 def planned_points(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = ()) -> list[dict[str, Any] | None]:
@@ -56,8 +61,6 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
         SpecError: There are too many combinations to check.
     """
     ends = {name: _ends(spec, name) for name in spec.space if name in _DECIDE_SIZE}
-    if "hidden_sizes" in ends:
-        ends["hidden_sizes"] = [as_sizes(value) for value in ends["hidden_sizes"]]
     combinations = math.prod(map(len, ends.values()))
     if combinations > _MAX_COMBINATIONS:
         raise SpecError(
@@ -73,9 +76,12 @@ def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[H
 def _ends(spec: SweepSpec, name: str) -> list[Any]:
     """Return values of a hyperparameter of which one makes the largest trial; also the one where it does not act."""
     domain = spec.space[name]
-    if not domain.when:
-        return _ends_of(domain)
-    return [*_ends_of(domain), spec.value_without(name)]
+    found = _ends_of(domain) + ([spec.value_without(name)] if domain.when else [])
+    # The ends of a range are floats, and so may be what a file lists; a trial has them as its algorithm takes them.
+    ends = [as_taken(spec.algorithm, name, value) for value in found]
+    if name == "replay":
+        return [max(ends, key=_REPLAYS.index)]
+    return [max(ends)] if name in _GREATEST_IS_LARGEST else ends
 
 
 def _ends_of(domain: Domain) -> list[Any]:

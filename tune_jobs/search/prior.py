@@ -10,13 +10,17 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from pydantic import ValidationError
+
 from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
-from analysis.wording import counted
+from analysis.wording import counted, is_number
 from policies.errors import SpecError, shortened
-from tune_jobs.search.chosen_point import outside
+from tune_jobs.search.chosen_point import as_written, outside
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.warped import rank_of, shares_of
 from tune_jobs.spec.conditions import Conditions
+from tune_jobs.spec.domains import Range
+from tune_jobs.spec.hyperparam_problems import as_taken
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _ENOUGH = 10
@@ -71,11 +75,24 @@ def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
 def _seen_by(spec: SweepSpec, earlier: SweepSpec, known: KnownPoint) -> dict[str, Any] | None:
     """Return a point with the names of the new sweep; None: it could not have that point."""
     values = {name: earlier.hyperparams[name] for name in spec.space if name in earlier.hyperparams} | dict(known.point)
+    try:
+        # The other sweep may have listed or fixed the same value in another form, as 64 for [64].
+        values = {name: _in_form_of(spec, name, value) for name, value in values.items()}
+    except ValidationError:
+        return None
     acting = Conditions(spec.space).acting(values)
     if not acting <= values.keys():
         return None
     point = {name: values[name] for name in spec.space if name in acting}
     return None if outside(spec.space, point) else point
+
+
+def _in_form_of(spec: SweepSpec, name: str, value: Any) -> Any:
+    """Return a value in the form of its domain; `ValidationError`: the hyperparameter does not take it."""
+    as_taken(spec.algorithm, name, value)
+    domain = spec.space[name]
+    is_outside = isinstance(domain, Range) and not is_number(value)
+    return value if is_outside else as_written(spec, name, domain, value)
 
 
 def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> list[KnownPoint]:

@@ -10,8 +10,9 @@ from analysis.records import TRAINING_LENGTH
 from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.suggestions import did_you_mean
-from tune_jobs.spec.conditions import in_order, listed_text, named_values
+from tune_jobs.spec.conditions import in_order, key_of, listed_text, named_values
 from tune_jobs.spec.domains import Domain, Grid, Layers, Listed, Range
+from tune_jobs.spec.plain_data import yaml_text
 from tune_jobs.spec.problems import Problem
 
 _MOST_SHOWN = 8
@@ -74,7 +75,8 @@ def _problems_of(given: _Given, name: str, other: str, wanted: Any) -> Iterator[
         return
     domain = given.space[other]
     if isinstance(domain, Layers) or (isinstance(domain, Range) and not domain.is_stepped):
-        why = "draws each layer's size" if isinstance(domain, Layers) else f"hardly ever draws exactly {_text(wanted)}"
+        exactly = f"hardly ever draws exactly {yaml_text(wanted)}"
+        why = "draws each layer's size" if isinstance(domain, Layers) else exactly
         yield "", f"can't be a condition: {other} ({domain.kind}) {why}. Name one with listed values or whole numbers"
         return
     if given.are_grids_tried and isinstance(given.space[name], Grid) and not isinstance(domain, Grid):
@@ -87,18 +89,18 @@ def _problems_of(given: _Given, name: str, other: str, wanted: Any) -> Iterator[
     if not values:
         yield "", f"lists no value of {other}: list at least one, or take the condition out"
     for index, value in enumerate(values):
-        if not domain.gives(value):
+        if not (domain.lists(value) if isinstance(domain, Listed) else domain.gives(value)):
             place = f"[{index}]" if isinstance(wanted, list | tuple) else ""
-            yield place, f"{_text(value)} is no value that {other} can have: {_domain_text(domain, value)}"
+            yield place, f"{yaml_text(value)} is no value that {other} can have: {_domain_text(domain, value)}"
 
 
 def _not_searched(given: _Given, name: str, other: str) -> str:
     fields = HYPERPARAMS_BY_ALGORITHM[given.algorithm].model_fields
     if other in given.fixed:
-        told = f"is fixed at {_text(given.fixed[other])} under hyperparams, not searched"
+        told = f"is fixed at {yaml_text(given.fixed[other])} under hyperparams, not searched"
         return f"{told}, so that {name} acts always or never: search {other} too, or take the condition out"
     if other in fields:
-        default = _text(fields[other].get_default(call_default_factory=True))
+        default = yaml_text(fields[other].get_default(call_default_factory=True))
         return (
             f"is not searched, and always {default}, its default: search {other} too, or take the condition out. "
             f"{name} would act always or never"
@@ -138,7 +140,8 @@ def _contradictions(space: Mapping[str, Domain]) -> Iterator[Problem]:
             own = {other: (list(named_values(space[other], given)), name)}
             for searched, (values, source) in [*needs[other].items(), *own.items()]:
                 known, before = needs[name].get(searched, (values, source))
-                both = [value for value in values if any(_is_same(value, one) for one in known)]
+                keys = {key_of(space[searched], one) for one in known}
+                both = [value for value in values if key_of(space[searched], value) in keys]
                 if not both:
                     yield Problem(
                         f"space.{name}.when",
@@ -154,19 +157,13 @@ def _contradictions(space: Mapping[str, Domain]) -> Iterator[Problem]:
             break
 
 
-def _is_same(value: Any, other: Any) -> bool:
-    return bool(value == other) and isinstance(value, bool) == isinstance(other, bool)
-
-
 def _domain_text(domain: Domain, value: Any) -> str:
     if isinstance(domain, Listed):
-        listed = ", ".join(map(_text, domain.values[:_MOST_SHOWN]))
+        listed = ", ".join(map(yaml_text, domain.values[:_MOST_SHOWN]))
         more = ", ..." if len(domain.values) > _MOST_SHOWN else ""
         texts = [item for item in domain.values if isinstance(item, str)]
         hint = did_you_mean(value, texts) if isinstance(value, str) else ""
         return f"it is one of {listed}{more}.{hint}"
-    return f"its domain is {domain.kind} {shortened(domain.model_dump(mode='json')[domain.kind])}"
-
-
-def _text(value: Any) -> str:
-    return shortened(list(value) if isinstance(value, tuple) else value)
+    told = f"its domain is {domain.kind} {shortened(domain.model_dump(mode='json')[domain.kind])}"
+    is_end = isinstance(domain, Range) and domain.is_whole and (domain.q or 1) == 1 and value == domain.high
+    return f"{told}, whose upper end is left out" if is_end else told

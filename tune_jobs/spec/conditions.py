@@ -7,13 +7,14 @@ value for what does not act in it; the trial then takes the value under `hyperpa
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Any
 
 from analysis.wording import is_number, short_text
+from tune_jobs.spec.domain_kinds import text_of
 from tune_jobs.spec.domains import Domain, Listed, Range
+from tune_jobs.spec.plain_data import yaml_text
 
 
 class Conditions:
@@ -31,7 +32,7 @@ class Conditions:
         """What each hyperparameter with a condition needs, those that others depend on first."""
         return {
             name: {
-                other: frozenset(_key(self._space[other], value) for value in named_values(self._space[other], given))
+                other: frozenset(key_of(self._space[other], value) for value in named_values(self._space[other], given))
                 for other, given in (self._space[name].when or {}).items()
             }
             for name in in_order(self._space)
@@ -52,7 +53,7 @@ class Conditions:
         idle: set[str] = set()
         for name, needs in self._needed.items():
             for other, keys in needs.items():
-                if other in idle or other not in values or _key(self._space[other], values[other]) not in keys:
+                if other in idle or other not in values or key_of(self._space[other], values[other]) not in keys:
                     idle.add(name)
                     break
         return {name for name in self._space if name not in idle}
@@ -67,7 +68,7 @@ class Conditions:
 
 def named_values(domain: Domain, given: Any) -> tuple[Any, ...]:
     """Return the values that a condition names: a list is several, unless the domain lists it as one value."""
-    if isinstance(given, list | tuple) and not (isinstance(domain, Listed) and domain.gives(given)):
+    if isinstance(given, list | tuple) and not (isinstance(domain, Listed) and domain.lists(given)):
         return tuple(given)
     return (given,)
 
@@ -96,9 +97,15 @@ def needed_text(space: Mapping[str, Domain], name: str) -> str:
 
 def listed_text(values: Iterable[Any]) -> str:
     """Return values as a sentence has them."""
-    return " or ".join(short_text(value) if not isinstance(value, bool) else str(value).lower() for value in values)
+    return " or ".join(
+        yaml_text(value) if value is None or isinstance(value, bool) else short_text(value) for value in values
+    )
 
 
-def _key(domain: Domain, value: Any) -> str:
-    """Return a text that is equal for equal values: of ranges 16 is 16.0, of lists true is not 1."""
-    return repr(float(value)) if isinstance(domain, Range) and is_number(value) else json.dumps(value)
+def key_of(domain: Domain, value: Any) -> str:
+    """Return a text that is equal for values of a domain that mean the same, in whatever form; true is not 1."""
+    if not (isinstance(domain, Range) and is_number(value)):
+        return text_of(value)
+    # Of steps, such as those of 0.1, a value counts that is one but for rounding.
+    is_step = domain.is_stepped and domain.gives(value)
+    return repr(float(domain.of_code(domain.code_of(value)) if is_step else value))

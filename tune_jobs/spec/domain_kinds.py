@@ -20,11 +20,14 @@ from pydantic import (
 )
 from typing_extensions import override
 
+from analysis.wording import is_number
+from tune_jobs.spec.plain_data import yaml_text
+
 
 def _refuse_coercion(value: Any) -> Any:
     # Pydantic would read true as 1 and "5" as 5, but a quoted or misspelt value is better refused than guessed.
     if isinstance(value, bool | str):
-        raise ValueError(f"{value!r} is not a number")  # noqa: TRY004 - pydantic reports ValueErrors only
+        raise ValueError(f"{yaml_text(value)} is not a number")  # noqa: TRY004 - pydantic reports ValueErrors only
     return value
 
 
@@ -33,6 +36,18 @@ Number = Annotated[float, BeforeValidator(_refuse_coercion), Field(allow_inf_nan
 
 WholeNumber = Annotated[int, BeforeValidator(_refuse_coercion)]
 """An int, or a float without a fraction such as 1e5; strings and true/false are refused."""
+
+
+def text_of(value: Any) -> str:
+    """Return a text that is equal for values that mean the same: 2e4 is 20000, [64] is 64, but true is not 1."""
+    return json.dumps(_in_one_form(value))
+
+
+def _in_one_form(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        items = list(map(_in_one_form, value))
+        return items[0] if len(items) == 1 and is_number(items[0]) else items
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 class AnyDomain(BaseModel, ABC):
@@ -100,7 +115,7 @@ class Listed(AnyDomain):
             key = repr(value)
             if key in seen:
                 raise ValueError(
-                    f"lists {value!r} twice: list it once (seeds_per_point repeats points with other seeds)"
+                    f"lists {yaml_text(value)} twice: list it once (seeds_per_point repeats points with other seeds)"
                 )
             seen.append(key)
         return self
@@ -116,6 +131,14 @@ class Listed(AnyDomain):
     @override
     def gives(self, value: Any) -> bool:
         return json.dumps(value) in self._texts
+
+    def lists(self, value: Any) -> bool:
+        """Whether a value is listed in whatever form: 2e4 is 20000, and 64 is the list [64]."""
+        return text_of(value) in self._meanings
+
+    @cached_property
+    def _meanings(self) -> frozenset[str]:
+        return frozenset(map(text_of, self.values))
 
     @cached_property
     def _texts(self) -> list[str]:

@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Discriminator, Tag
 from policies.suggestions import did_you_mean
 from tune_jobs.spec.domain_kinds import AnyDomain, Choice, Grid, Listed
 from tune_jobs.spec.layers import Layers
+from tune_jobs.spec.plain_data import yaml_text
 from tune_jobs.spec.ranges import (
     LogRandInt,
     LogUniform,
@@ -42,6 +43,7 @@ _KINDS: dict[str, type[AnyDomain]] = {
         PowerOfTwo, OneMinusLogUniform, Layers,
     )
 }  # fmt: skip
+_MOST_SHOWN = 4
 DOMAIN_KINDS: tuple[str, ...] = tuple(_KINDS)
 
 
@@ -66,13 +68,14 @@ def _check_shape(value: Any) -> Any:
         )
     if not isinstance(value, Mapping):
         raise ValueError(  # noqa: TRY004 - as above
-            f"{value!r} is one value: fix it under hyperparams, or write a domain such as {{grid: [...]}}"
+            f"{yaml_text(value)} is one value: fix it under hyperparams, or write a domain such as {{grid: [...]}}"
         )
     found = _kinds_in(value)
     if len(found) != 1:
         kinds = ", ".join(DOMAIN_KINDS)
         beside = " beside when" if "when" in value else ""
-        raise ValueError(f"needs exactly one key{beside}, the kind of the domain ({kinds}), and has {len(found)}")
+        has = " and ".join(map(str, found[:_MOST_SHOWN])) + (" and more" if len(found) > _MOST_SHOWN else "")
+        raise ValueError(f"needs exactly one key{beside}, the kind of the domain ({kinds}), and has {has or 'none'}")
     kind = found[0]
     if kind not in _KINDS:
         suggestion = did_you_mean(kind, DOMAIN_KINDS)

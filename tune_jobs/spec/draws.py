@@ -11,7 +11,7 @@ from policies import random_streams
 from tune_jobs.spec.conditions import Conditions, in_order
 from tune_jobs.spec.domains import Domain, Grid
 
-_MOST_COMBINATIONS = 1_000_000
+MOST_COMBINATIONS = 1_000_000
 """Of grids with conditions, more than these are not counted; no sweep can have as many."""
 
 
@@ -117,7 +117,7 @@ def _acting_indexes(space: Mapping[str, Domain], names: list[str]) -> list[dict[
                 known = {other: grids[other].values[index] for other, index in indexes.items()}
                 acts = name in conditions.acting(known)
                 grown += [indexes | {name: index} for index in range(len(grids[name].values))] if acts else [indexes]
-                if len(grown) >= _MOST_COMBINATIONS:
+                if len(grown) >= MOST_COMBINATIONS:
                     return grown
             found = grown
     return found

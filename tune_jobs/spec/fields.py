@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from tune_jobs.spec.domain_kinds import Number, WholeNumber
+from tune_jobs.spec.plain_data import yaml_text
 
 Flag = Annotated[bool, Field(strict=True)]
 """true or false, but no string or number in their place."""
@@ -25,7 +26,7 @@ def name_or_flag(value: Any) -> Any:
     """
     if value is None or isinstance(value, bool) or (isinstance(value, str) and value):
         return value
-    raise ValueError(f"{value!r} is not allowed: it should be a name, true or false")
+    raise ValueError(f"{yaml_text(value)} is not allowed: it should be a name, true or false")
 
 
 class Section(BaseModel):

@@ -186,6 +186,7 @@ def json_schema() -> dict[str, Any]:
     names = {"type": "string", "enum": [*texts["enum"], *get_args(Cost)]}
     pair = {"type": "array", "items": names, "minItems": 2, "maxItems": 2, "uniqueItems": True}
     properties["objective"]["anyOf"] = [texts, pair, mapping]
+    definitions["ObjectiveSpec"]["properties"]["type"] |= {"enum": texts["enum"]}
     definitions["EnvSpec"]["properties"]["atari"]["anyOf"].append({"type": "boolean"})
     for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
         # A section whose lines are all commented out is null.
@@ -264,7 +265,7 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
             f"--set {override}: this is not an assignment",
             "Write --set a.b=value, such as --set stop.num_env_steps=50000.",
         )
-    *parents, last = ["space", TRAINING_LENGTH] if path == f"space.{TRAINING_LENGTH}" else path.split(".")
+    *parents, last = _names_in(path)
     section = data
     for index, parent in enumerate(parents):
         child = section.get(parent)
@@ -287,11 +288,22 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
     return path
 
 
+def _names_in(path: str) -> list[str]:
+    """Return the names of a path; one of them has a dot, where searched hyperparameters are named."""
+    parts, names = path.split("."), list[str]()
+    while parts:
+        is_of_space = names == ["space"] or (names[:1] == ["space"] and names[2:] == ["when"])
+        num = 2 if is_of_space and ".".join(parts[:2]) == TRAINING_LENGTH else 1
+        names.append(".".join(parts[:num]))
+        parts = parts[num:]
+    return names
+
+
 def _is_known(path: str) -> bool:
     """Whether a sweep file may have a field of this path."""
-    section, *names = path.split(".")
+    section, *names = _names_in(path)
     if section in ("hyperparams", "space") and names:
-        if path == f"space.{TRAINING_LENGTH}":
+        if section == "space" and names[0] == TRAINING_LENGTH:
             return True
         return any(names[0] in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values())
     field = SweepSpec.model_fields.get(section)

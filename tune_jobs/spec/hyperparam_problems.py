@@ -19,8 +19,9 @@ from policies.foreign_names import answer_for_others, answer_to
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from policies.suggestions import did_you_mean
 from policies.wrong_values import details_of, dotted, explain
-from tune_jobs.spec.domains import Domain, Listed, Range
+from tune_jobs.spec.domains import Domain, Layers, Listed, Range
 from tune_jobs.spec.list_forms import list_to_write, text_of_several
+from tune_jobs.spec.plain_data import yaml_text
 from tune_jobs.spec.problems import SPEC_HINT, Problem
 from tune_jobs.spec.sections import StopSpec
 
@@ -56,7 +57,7 @@ def hyperparam_problems(
         if name in fields:
             problems += value_problems(algorithm, name, value, path=f"hyperparams.{name}")
         if name in space and not space[name].when:  # with a condition, it is the value where that does not hold
-            text = f"is fixed at {value!r} but also searched in space.{name}: take it out of one of them"
+            text = f"is fixed at {yaml_text(value)} but also searched in space.{name}: take it out of one of them"
             problems.append(Problem(f"hyperparams.{name}", text))
     for name, domain in space.items():
         if name in fields or name == TRAINING_LENGTH:
@@ -78,7 +79,8 @@ def check_distinct(algorithm: Algorithm, space: Mapping[str, Domain]) -> None:
             first = seen.setdefault(in_one_form(algorithm, name, value), index)
             if first != index:
                 raise SpecError(
-                    f"space.{name}.{domain.kind}[{index}]: {value!r} is the same as {domain.values[first]!r}, in "
+                    f"space.{name}.{domain.kind}[{index}]: {yaml_text(value)} is the same as "
+                    f"{yaml_text(domain.values[first])}, in "
                     f"{domain.kind}[{first}]: list it once (seeds_per_point repeats points with other seeds)",
                     SPEC_HINT,
                 )
@@ -91,6 +93,15 @@ def in_one_form(algorithm: Algorithm, name: str, value: Any) -> str:
         pydantic.ValidationError: The hyperparameter does not take the value.
     """
     return json.dumps(_alone(algorithm, name).model_validate({name: value}).model_dump(mode="json"))
+
+
+def as_taken(algorithm: Algorithm, name: str, value: Any) -> Any:
+    """Return a value of a hyperparameter as trials have it: 1000 for 1000.0, and (64,) for 64.
+
+    Raises:
+        pydantic.ValidationError: The hyperparameter does not take the value.
+    """
+    return getattr(_alone(algorithm, name).model_validate({name: value}), name)
 
 
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
@@ -116,6 +127,9 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
         if found and index is None and isinstance(domain, Range):
             text = f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
             found = [Problem(path, text)]
+        if found and isinstance(domain, Layers) and all(problem.path.startswith(f"{path}[") for problem in found):
+            # Of each layer the same is told, and a file has no list of them.
+            found = [Problem(f"{path}.sizes", found[0].text)]
         problems += found
         if found and domain.kind not in ("grid", "choice"):
             break  # both ends of a range are usually wrong for the same reason
@@ -132,14 +146,13 @@ def value_problems(algorithm: Algorithm, name: str, value: Any, *, path: str) ->
         path: What messages call its place.
     """
     try:
-        checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
+        checked = as_taken(algorithm, name, value)
     except ValidationError as error:
         if (told := _told(algorithm, name, value, path=path)) is not None:
             return [Problem(path, told)]
         return [Problem(path + dotted(detail["loc"][1:], root=False), explain(detail)) for detail in details_of(error)]
     if not _same_kind(value, checked):
-        meant = list(checked) if isinstance(checked, tuple) else checked
-        return [Problem(path, f"{value!r} is of the wrong type: write {meant!r} if that is meant")]
+        return [Problem(path, f"{yaml_text(value)} is of the wrong type: write {yaml_text(checked)} if that is meant")]
     return []
 
 
@@ -158,7 +171,7 @@ def _told(algorithm: Algorithm, name: str, value: Any, *, path: str) -> str | No
 
 def _is_allowed(algorithm: Algorithm, name: str, value: Any) -> bool:
     try:
-        checked = getattr(_alone(algorithm, name).model_validate({name: value}), name)
+        checked = as_taken(algorithm, name, value)
     except ValidationError:
         return False
     return _same_kind(value, checked)

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 from typing_extensions import override
 
+from analysis.wording import is_number
 from tune_jobs.spec.domain_kinds import AnyDomain, Choice, WholeNumber
+from tune_jobs.spec.plain_data import yaml_text
 from tune_jobs.spec.ranges import LogRandInt, PowerOfTwo, QLogRandInt, QRandInt, RandInt
 
 MOST_LAYERS = 16
 """More hidden layers than anybody trains."""
+_Sizes = TypeVar("_Sizes", bound=AnyDomain)
 _SIZES = ("choice", "power_of_two", "randint", "lograndint", "qrandint", "qlograndint")
 
 
 def _ends(value: Any) -> Any:
-    return (value, value) if isinstance(value, int) and not isinstance(value, bool) else value
+    if isinstance(value, list | tuple):
+        return value
+    if not is_number(value) or not float(value).is_integer():
+        raise ValueError(f"{yaml_text(value)} is not allowed: it should be a whole number, or [fewest, most]")
+    return value, value
 
 
 def _domain_of_sizes(value: Any) -> Any:
@@ -30,8 +37,21 @@ def _domain_of_sizes(value: Any) -> Any:
             f"{dict(value)!r} is no domain of sizes: give a list such as [32, 64], or one of {', '.join(_SIZES)}"
         )
     if not isinstance(value, AnyDomain | Mapping):
-        raise ValueError(f"{value!r} is not allowed: give a list such as [32, 64], or {{power_of_two: [16, 256]}}")  # noqa: TRY004 - pydantic reports ValueErrors only
+        raise ValueError(  # noqa: TRY004 - pydantic reports ValueErrors only
+            f"{yaml_text(value)} is not allowed: give a list such as [32, 64], or {{power_of_two: [16, 256]}}"
+        )
     return value
+
+
+def _has_whole_sizes(sizes: _Sizes) -> _Sizes:
+    """Refuse listed sizes that are no whole numbers, which is not told of the lists that are made of them."""
+    for size in sizes.values if isinstance(sizes, Choice) else ():
+        if not (is_number(size) and size >= 1 and float(size).is_integer()):
+            raise ValueError(
+                f"{yaml_text(size)} is not allowed: each size is a whole number of at least 1, as in [32, 64], and how "
+                "many layers there are is the number"
+            )
+    return sizes
 
 
 def _kind_of(value: Any) -> str:
@@ -47,6 +67,7 @@ Sizes = Annotated[
     | Annotated[QLogRandInt, Tag("qlograndint")],
     Discriminator(_kind_of),
     BeforeValidator(_domain_of_sizes, json_schema_input_type=Any),
+    AfterValidator(_has_whole_sizes),
 ]
 
 
@@ -55,9 +76,10 @@ class LayersFields(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    number: Annotated[tuple[WholeNumber, WholeNumber], BeforeValidator(_ends)] = Field(
-        description="[fewest, most] layers, both included; a single number: always as many."
-    )
+    number: Annotated[
+        tuple[WholeNumber, WholeNumber],
+        BeforeValidator(_ends, json_schema_input_type=WholeNumber | tuple[WholeNumber, WholeNumber]),
+    ] = Field(description="[fewest, most] layers, both included; a single number: always as many.")
     sizes: Sizes = Field(description="The sizes that each layer may have: a list, or a domain of whole numbers.")
 
     @model_validator(mode="after")

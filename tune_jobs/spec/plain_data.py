@@ -37,6 +37,16 @@ def to_plain(value: Any, label: str) -> Any:
     return _Copy(label).of(value, "")
 
 
+def yaml_text(value: Any) -> str:
+    """Return a value as messages show it: with YAML's words true, false and null, cut to at most 80 characters."""
+    if isinstance(value, list | tuple):
+        text = f"[{', '.join(map(yaml_text, value))}]"
+        return text if len(text) <= 80 else f"{text[:77]}..."
+    if value is None:
+        return "null"
+    return str(value).lower() if isinstance(value, bool) else shortened(value)
+
+
 class _Copy:
     def __init__(self, label: str) -> None:
         self._label = label

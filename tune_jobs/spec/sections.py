@@ -5,6 +5,7 @@ Rules for several fields together are in `tune_jobs.spec.rules`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -215,6 +216,8 @@ def _two_objectives(value: Any) -> Any:
     """Let `objective` be written as a score, or as a score and its cost: `[return, env_steps]`."""
     if isinstance(value, str):
         return {"type": _RETURN.get(value, value)}
+    if isinstance(value, Mapping) and isinstance(value.get("type"), str):
+        return {**value, "type": _RETURN.get(value["type"], value["type"])}
     if not isinstance(value, list | tuple):
         return value
     names = [_RETURN.get(name, name) if isinstance(name, str) else name for name in value]
@@ -289,7 +292,10 @@ class SweepFields(Section):
     search: Annotated[SearchSpec, _from_text("type")] = Field(
         default_factory=SearchSpec, description="Search method: random, auto, gp, forest or tpe, or a mapping."
     )
-    prior: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], BeforeValidator(_one_or_several)] = Field(
+    prior: Annotated[
+        tuple[NameText, ...],
+        BeforeValidator(_one_or_several, json_schema_input_type=NameText | tuple[NameText, ...]),
+    ] = Field(
         (),
         description="Earlier sweeps, by name or place, whose points the model begins with: of the same algorithm and "
         "space, and of any environment. They are copied when the sweep is created.",
