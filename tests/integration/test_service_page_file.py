@@ -108,6 +108,15 @@ def test_it_is_shown_as_the_service_shows_it(page: Page, packed: bytes) -> None:
     assert [page.text(part) for part in parts] == served
 
 
+def test_the_score_of_its_setting_is_shown(page: Page, packed: bytes) -> None:
+    def change(content: Any) -> None:
+        content["best"]["settings"]["ranking"][0] |= {"score": 123.4, "expected": 120.0}
+
+    page.open("#/file")
+    drop(page, ("a.tunejobs", changed(packed, change)))
+    page.says(".finished", "123.4 return")
+
+
 def test_it_is_chosen_with_the_keyboard_and_kept_while_the_page_is_open(
     page: Page, packed: bytes, tmp_path: Path
 ) -> None:
@@ -283,6 +292,7 @@ NESTED = json.loads("[" * 900 + "]" * 900)
         (("status", "state"), "gone", "status.state is a text, not one of created"),
         (("sweep", "spec", "space"), {"lr": {"grid": 3}}, "sweep.spec.space.lr.grid is a number, not a list"),
         (("best", "settings", "ranking"), [], "best.settings.ranking is empty"),
+        (("best", "settings", "ranking", 0, "score"), "9", "best.settings.ranking[0].score is a text, not a finite"),
     ],
 )
 def test_what_is_wrong_in_a_sweep_is_said_with_its_place(

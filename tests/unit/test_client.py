@@ -102,6 +102,13 @@ def test_models_have_the_fields_of_the_services() -> None:
         assert own.model_fields.keys() == theirs.model_fields.keys()
 
 
+def test_a_service_that_does_not_say_whether_a_sweep_runs_is_understood(site: Live) -> None:
+    (found, *_) = site.get("/sweeps").json()["sweeps"]
+    assert answers.Summary.model_validate(found | {"alive": True}).alive is True
+    del found["alive"]
+    assert answers.Summary.model_validate(found).alive is False
+
+
 # -- changing
 
 

@@ -12,8 +12,11 @@ from store_parts import make_iteration
 from sweep_folders import make_sweep_folder
 
 from tune_jobs.service import statuses as module
+from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.event_log import EventLog
+from tune_jobs.service.service import opened
 from tune_jobs.service.statuses import Statuses
+from tune_jobs.service.views import ListView, SweepView
 from tune_jobs.service.watching import Follower
 from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
@@ -105,6 +108,23 @@ def test_a_sweep_that_begins_or_ends_is_seen_at_once(tmp_path: Path, read: list[
     seen = statuses.see("mine")
     assert not seen.status.alive
     assert seen.status.counts == {"completed": 4}
+
+
+def test_the_end_of_the_process_that_runs_a_sweep_is_an_event(tmp_path: Path) -> None:
+    """After its trials it writes the result: nothing else tells that this is there."""
+    store = make_sweep_folder(tmp_path / "sweeps" / "mine")
+    with opened(ServiceConfig(storage=tmp_path / "sweeps", port=0, spare_idle_s=0)) as service:
+        view = SweepView("mine", service.storage, service.statuses, service.queue, service.labels)
+        whole = ListView(service.statuses, service.queue, service.labels)
+        with store.lock():
+            (kind, data), *_ = view.changes()
+            assert (kind, data["state"], data["alive"]) == ("status", "completed", True)
+            assert whole.changes() == view.changes() == []
+        ((kind, data),) = view.changes()
+        assert (kind, data["state"], data["alive"]) == ("status", "completed", False)
+        ((kind, data),) = whole.changes()
+        assert (kind, data["sweeps"][0]["alive"]) == ("sweeps", False)
+        assert view.changes() == []
 
 
 def test_what_takes_long_is_done_less_often_and_yet_done(

@@ -44,6 +44,7 @@ class Summary(_Answer):
 
     name: str
     state: str = Field(description="created, running, interrupted or completed.")
+    alive: bool = Field(default=False, description="Whether a process runs it now; older services don't say.")
     owner: str | None
     note: str
     tags: list[str]

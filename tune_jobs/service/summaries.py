@@ -21,6 +21,7 @@ class SweepSummary(BaseModel):
 
     name: str
     state: str = Field(description="created, running, interrupted, completed.")
+    alive: bool = Field(description="Whether a process runs it now; after its trials, that writes the result.")
     owner: str | None = Field(description="Who submitted it; null: nobody did, here.")
     note: str
     tags: list[str]
@@ -48,6 +49,7 @@ def summary(seen: Seen, label: Label, job: Job | None) -> SweepSummary:
     return SweepSummary(
         name=record.name,
         state=status.state,
+        alive=status.alive,
         owner=label.owner,
         note=label.note,
         tags=list(label.tags),

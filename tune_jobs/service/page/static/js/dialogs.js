@@ -81,8 +81,13 @@ export function askInDialog({ title, text, fields = [], label, isDangerous = fal
     removeEventListener("hashchange", left);
     dialog.remove();
   });
+  // Who selects a text in it and lets go outside has clicked on the dialog, too.
+  let beganOutside = false;
+  dialog.addEventListener("pointerdown", (event) => {
+    beganOutside = event.target === dialog;
+  });
   dialog.addEventListener("click", (event) => {
-    if (event.target === dialog) dialog.close();
+    if (event.target === dialog && beganOutside) dialog.close();
   });
   form.addEventListener("submit", async (event) => {
     event.preventDefault();

@@ -29,10 +29,19 @@ export function setAttribute(node, name, value) {
 
 // Make the children of a node those of the items, in their order; what stays keeps its focus and its scroll.
 export function reconcile(parent, items, keyOf, make, update) {
-  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  const keys = items.map((item) => String(keyOf(item)));
+  const wanted = new Set(keys);
+  const focused = parent.contains(document.activeElement) ? document.activeElement : null;
+  const known = new Map();
+  // What leaves goes first, so that what stays need not move; of several with one key one stays.
+  for (const child of [...parent.children]) {
+    const { key } = child.dataset;
+    if (wanted.has(key) && !known.has(key)) known.set(key, child);
+    else child.remove();
+  }
   let place = parent.firstElementChild;
-  for (const item of items) {
-    const key = String(keyOf(item));
+  for (const [index, item] of items.entries()) {
+    const key = keys[index];
     let node = known.get(key);
     known.delete(key);
     if (!node) {
@@ -43,7 +52,8 @@ export function reconcile(parent, items, keyOf, make, update) {
     if (node === place) place = place.nextElementSibling;
     else parent.insertBefore(node, place);
   }
-  for (const node of known.values()) node.remove();
+  // What was moved has lost it.
+  if (focused?.isConnected && focused !== document.activeElement) focused.focus({ preventScroll: true });
 }
 
 // Say something to screen readers alone.

@@ -22,6 +22,7 @@ export class Finished {
 
   // Asked for once each time the sweep has come to an end, or goes on: what it came to before is shown until then.
   async follow(sweep) {
+    // Its group is another one when the process has ended, which writes the result after the trials.
     const stamp = `${stateOf(sweep).group} ${sweep.state} ${sweep.ended_at} ${sweep.job?.ended_at}`;
     if (stamp === this.stamp) return;
     this.stamp = stamp;

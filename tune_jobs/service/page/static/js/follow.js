@@ -41,13 +41,12 @@ export function follow({ load, kinds, apply, show, opened = null }) {
     try {
       const path = await load();
       if (own !== run || isClosed) return;
-      failures = 0;
-      tell(true);
       show(null);
       listen(path);
     } catch (error) {
       if (own !== run || isClosed || error.name === "AbortError") return;
-      tell(error instanceof Refused);
+      // A proxy whose service is away answers too.
+      tell(error instanceof Refused && error.status < 500);
       show(error);
       later();
     }
@@ -74,6 +73,8 @@ export function follow({ load, kinds, apply, show, opened = null }) {
     }
     own.addEventListener("reset", begin);
     own.addEventListener("open", async () => {
+      // Not before: what can be loaded may yet refuse its events.
+      failures = 0;
       tell(true);
       if (opened === null) return;
       await opened().catch(() => own === source && begin());
@@ -83,6 +84,7 @@ export function follow({ load, kinds, apply, show, opened = null }) {
       // The browser connects again by itself, unless it was refused.
       if (own === source && own.readyState === EventSource.CLOSED) {
         source = null;
+        tell(false);
         later();
       } else if (own === source) tell(false);
     });

@@ -73,7 +73,9 @@ function rangeAxis(name, kind, values) {
       text: settingText(value, 3),
       at: place(value),
     })),
-    rangeText: (from, to) => `${rounded(valueAt(from))}..${rounded(valueAt(to))}`,
+    // An end of the axis is the value of a trial, which rounding would leave out.
+    rangeText: (from, to) =>
+      `${from <= 0 ? low : rounded(valueAt(from))}..${to >= 1 ? high : rounded(valueAt(to))}`,
     test: (range) => {
       const [from, to] = range.split("..").map(Number);
       return (value) => value >= from && value <= to;

@@ -3,7 +3,10 @@ import { waitText } from "./waits.js";
 
 const TONES = { running: "live", stopping: "live", waiting: "wait", completed: "good", failed: "bad" };
 
-export const isLive = (sweep) => sweep.state === "running" || sweep.job?.state === "running" || Boolean(sweep.waiting);
+// What is being written by the service is held by a process too, and does not run yet.
+const isDriven = (sweep) => Boolean(sweep.alive) && sweep.job?.state !== "creating";
+export const isLive = (sweep) =>
+  sweep.state === "running" || sweep.job?.state === "running" || Boolean(sweep.waiting) || isDriven(sweep);
 export const isWaiting = (sweep) => !isLive(sweep) && ["waiting", "creating"].includes(sweep.job?.state);
 
 export function stateOf(sweep) {

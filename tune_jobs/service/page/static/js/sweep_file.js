@@ -175,6 +175,7 @@ const front = is.object({
 const setting = is.object({
   point,
   scores: is.listOf(maybe(is.number)),
+  score: maybe(is.number),
   expected: maybe(is.number),
   lower: maybe(is.number),
   upper: maybe(is.number),

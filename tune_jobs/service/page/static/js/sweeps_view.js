@@ -156,10 +156,16 @@ export function openSweeps(main, route) {
   }
 
   const known = new Map();
+  // The names that events came for since the list was last asked for: what it says of them may be older.
+  let touched = new Set();
   async function fetchAll() {
+    touched = new Set();
+    const own = touched;
     const found = await askAll("sweeps", "sweeps");
-    known.clear();
-    for (const sweep of found) known.set(sweep.name, sweep);
+    // A later one is on its way, or was here first.
+    if (own !== touched) return;
+    for (const name of known.keys()) if (!own.has(name)) known.delete(name);
+    for (const sweep of found) if (!own.has(sweep.name)) known.set(sweep.name, sweep);
   }
   const followed = follow({
     kinds: ["sweeps", "deleted"],
@@ -169,6 +175,7 @@ export function openSweeps(main, route) {
     },
     opened: fetchAll,
     apply(kind, data) {
+      for (const name of data.names ?? data.sweeps.map((sweep) => sweep.name)) touched.add(name);
       if (kind === "sweeps") for (const sweep of data.sweeps) known.set(sweep.name, sweep);
       else for (const name of data.names) known.delete(name);
     },

@@ -28,7 +28,8 @@ export class TrialTable {
       this.body,
       el("tbody", { "aria-hidden": "true" }, this.below),
     );
-    this.scroller = el("div", { class: "scroller", role: "region", "aria-label": "Table of trials" }, this.table);
+    const region = { class: "scroller", role: "region", "aria-label": "Table of trials", tabindex: -1 };
+    this.scroller = el("div", region, this.table);
     this.told = el("p", { class: "quiet small", role: "status" });
     this.none = el("p", { class: "empty quiet", hidden: true }, "No trial matches.");
     host.append(this.scroller, this.none);

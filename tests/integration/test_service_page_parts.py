@@ -1,0 +1,121 @@
+"""Parts of the service's page by themselves: ranges of axes, lists that change, a dialog."""
+
+from typing import Any
+
+import pytest
+from page_browser import IN_A_BROWSER, Page
+
+pytestmark = IN_A_BROWSER
+RANGES = """
+    const [{ axesOf }, [kind, values]] = [module, given];
+    const trials = values.map((value) => ({ point: { x: value }, score: null }));
+    const [axis] = axesOf([{ name: "x", kind, values: [] }], trials);
+    return [[0, 1], [0.5, 1], [0, 0.5]].map(([low, high]) => {
+      const text = axis.rangeText(low, high);
+      return [text, values.filter(axis.test(text)), axis.ends(text)];
+    });
+"""
+RECONCILED = """
+    const place = document.createElement("ul");
+    place.tabIndex = -1;
+    document.querySelector("main").replaceChildren(place);
+    const make = (text) => {
+      const node = document.createElement("li");
+      node.tabIndex = 0;
+      node.textContent = text;
+      return node;
+    };
+    const told = [];
+    for (const texts of given) {
+      module.reconcile(place, texts, (text) => text, make, () => {});
+      // The one that is named c has it from the start.
+      if (!told.length) [...place.children].find((node) => node.textContent === "c")?.focus();
+      told.push([[...place.children].map((node) => node.textContent).join(""), document.activeElement.textContent]);
+    }
+    return told;
+"""
+TABLE = """
+    const main = document.querySelector("main");
+    main.replaceChildren();
+    const nothing = () => {};
+    const acts = { onSort: nothing, onOpen: nothing, onChoose: nothing, onHover: nothing };
+    const table = new module.TrialTable(main, acts);
+    const columns = [{ key: "trial", label: "trial", text: (row) => row.trial_id }];
+    const show = (ids) => table.show({
+      rows: ids.map((trial_id) => ({ trial_id })), numAll: 4, columns, sort: "trial", isRising: true,
+      chosen: new Map(), opened: null,
+    });
+    show(["t0000", "t0001", "t0002", "t0003"]);
+    table.focus(3);
+    return given.map((ids) => {
+      show(ids);
+      const { activeElement: node } = document;
+      return node.dataset.key ?? node.className;
+    });
+"""
+
+
+def run_module(page: Page, name: str, script: str, given: Any) -> Any:
+    """Run a script with a module of the page and something that is given to it."""
+    page.open("#/file")
+    made = f"""
+        const [name, given, done] = arguments;
+        import(new URL(`static/js/${{name}}.js`, document.baseURI))
+          .then((module) => {{ {script} }}).then(done, (error) => done(String(error)));
+    """
+    return page.browser.execute_async_script(made, name, given)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("linear", [-123.456789, 7.5, 196.987654]),
+        ("log", [1.23456789e-7, 1e-4, 9.87654321e-3]),
+        ("near one", [0.9123456789, 0.99, 0.99912345678]),
+    ],
+)
+def test_a_range_to_the_end_of_an_axis_has_the_trial_that_lies_there(
+    page: Page, kind: str, values: list[float]
+) -> None:
+    low, _, high = values
+    whole, upper, lower = run_module(page, "parallel_axes", RANGES, [kind, values])
+    assert [float(end) for end in whole[0].split("..")] == [low, high]
+    assert whole[1:] == [values, [0, 1]]
+    assert high in upper[1]
+    assert low not in upper[1]
+    assert upper[2][1] == 1
+    assert low in lower[1]
+    assert high not in lower[1]
+    assert lower[2][0] == 0
+
+
+def test_a_list_with_one_key_twice_stays_as_long_as_it_is(page: Page) -> None:
+    told = run_module(page, "dom", RECONCILED, [["a", "a", "b"]] * 4 + [["b"]])
+    assert [texts for texts, _ in told] == ["aab"] * 4 + ["b"]
+
+
+def test_the_focus_stays_where_what_was_before_it_leaves_or_moves(page: Page) -> None:
+    lists = [["a", "b", "c"], ["b", "c"], ["c"], ["c", "a"], ["a", "c"], ["x", "c", "a"], ["a"]]
+    told = run_module(page, "dom", RECONCILED, [list(texts) for texts in lists])
+    assert [texts for texts, _ in told] == ["".join(texts) for texts in lists]
+    assert [focused for _, focused in told[:-1]] == ["c"] * 6
+
+
+def test_the_focus_goes_with_a_row_and_to_the_table_where_it_leaves(page: Page) -> None:
+    shown = [["t0001", "t0002", "t0003"], ["t0003", "t0001"], ["t0001", "t0003"], ["t0001"]]
+    told = run_module(page, "trial_table", TABLE, shown)
+    assert told == ["t0003", "t0003", "t0003", "scroller"]
+
+
+def test_a_dialog_stays_when_a_selection_in_it_ends_outside(page: Page) -> None:
+    page.open("#/sweeps/pendulum-no-space")
+    page.button("More").click()
+    page.button("Note, tags, priority…").click()
+    heading = page.one(".dialog h2")
+    page.drag(heading, (20, 8), (-20, 0), (-300, 0))
+    assert page.one(".dialog").is_displayed()
+    # A click that is outside altogether closes it.
+    page.drag(heading, (20, 8))
+    assert page.one(".dialog").is_displayed()
+    page.drag(heading, (-300, 8))
+    page.wait("return document.querySelector('.dialog') === null")
