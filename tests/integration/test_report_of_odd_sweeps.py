@@ -44,7 +44,8 @@ def test_any_sweep_gives_a_page(tmp_path: Path, kind: str) -> None:
     _, html, page = report(tmp_path, synthetic)
     assert ("No winner" in page.words) == (synthetic.best is None)
     assert "nan" not in page.words.lower().split()
-    assert "None" not in page.words
+    # The programs for other libraries have it, as they are Python's.
+    assert "None" not in page.words.replace("grad_clip=None", "")
     if kind == "no threshold":
         assert '<span class="badge">no threshold</span>' in html
 
