@@ -242,6 +242,7 @@ class PriorRecord(Record):
     sweep: str = Field(description="Its name.")
     env_id: str = Field(description="The environment that it trained in.")
     points: tuple[PriorPointRecord, ...] = Field(description="Its points that the later sweep could have.")
+    num_ended: int | None = Field(None, description="How many of its points had ended; None: a former record.")
 
 
 class JobRecord(Record):

@@ -15,7 +15,7 @@ from policies.errors import NotFoundError, SpecError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.search.history import KnownPoint
-from tune_jobs.search.prior import with_prior
+from tune_jobs.search.prior import prior_notes, with_prior
 from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.file import load_spec, stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -149,6 +149,17 @@ def test_a_sweep_that_differs_is_refused_with_what_differs(
     with pytest.raises(SpecError) as caught:
         begun(tmp_path, **changes)
     assert all(word in caught.value.message for word in ["prior: sweep first", *words]), caught.value.message
+
+
+def test_points_that_this_space_does_not_have_are_counted(earlier: SweepStore, tmp_path: Path) -> None:
+    _, (whole,) = begun(tmp_path)
+    middle = sorted(item.point["lr"] for item in whole.points)[5]
+    narrower = {"lr": {"loguniform": [middle * 0.999, 1e-1]}}
+    spec, (prior,) = begun(tmp_path, space=narrower)
+    assert (len(prior.points), prior.num_ended) == (6, 11)
+    assert prior_notes(spec, [prior]) == ("The model begins with 6 of the 11 ended points of sweep first.",)
+    former = prior.model_copy(update={"num_ended": None})
+    assert prior_notes(spec, [former]) == ("The model begins with 6 points of sweep first.",)
 
 
 def test_a_name_that_was_fixed_there_has_that_value(tmp_path: Path) -> None:

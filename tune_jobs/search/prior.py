@@ -50,7 +50,7 @@ def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequenc
     if not kept:
         why = f"none of its {counted(len(ended), 'ended point')} lies in this space" if ended else "no point has ended"
         raise SpecError(f"prior: sweep {name} tells nothing, as {why}.", "Widen the space, or leave it out.")
-    return PriorRecord(sweep=name, env_id=earlier.env.id, points=tuple(kept))
+    return PriorRecord(sweep=name, env_id=earlier.env.id, points=tuple(kept), num_ended=len(ended))
 
 
 def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
@@ -146,5 +146,10 @@ def prior_notes(spec: SweepSpec, prior: Sequence[PriorRecord]) -> tuple[str, ...
     notes = []
     for each in prior:
         other = "" if each.env_id == spec.env.id else f", of {shortened(each.env_id)}, by their ranks there"
-        notes.append(f"The model begins with {counted(len(each.points), 'point')} of sweep {each.sweep}{other}.")
+        number, all_ended = len(each.points), each.num_ended
+        what = counted(number, "point")
+        if all_ended is not None and all_ended > number:
+            # The others are of values that this space doesn't have.
+            what = f"{number:,} of the {all_ended:,} ended points"
+        notes.append(f"The model begins with {what} of sweep {each.sweep}{other}.")
     return tuple(notes)
