@@ -53,10 +53,12 @@ $(VENV)/installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/installed-docs: $(VENV)/installed
 	$(INSTALL) --editable '.[docs]'
+	@$(COMPILE)
 	@touch $@
 
 $(VENV)/installed-bench: $(VENV)/installed
 	$(INSTALL) --editable '.[bench]'
+	@$(COMPILE)
 	@touch $@
 
 # In five processes on two cores, as many of the tests wait for processes of their own: two for those in tests/ray, each

@@ -18,7 +18,7 @@ def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
     planned = finite_or_none(sweep.env_threshold) if planned is None else planned
     if planned is not None:
         return planned
-    # Sweeps of former versions have none of their record.
+    # Records of former versions have none.
     import gymnasium
 
     # gymnasium.spec() would import the module that an id such as "module:Env-v0" names, so the registry is read.

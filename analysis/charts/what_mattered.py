@@ -142,10 +142,10 @@ def _binned(column: Column, indices: Sequence[int]) -> tuple[Axis, list[int]]:
 
 
 def _told_apart(numbers: Sequence[float]) -> list[str]:
-    """Return increasing numbers in as few digits as tell them apart, two at least."""
+    """Return numbers in as few digits as tell different ones apart, two at least."""
     for digits in range(2, 16):
         # Twice, as 1,050 of three digits alone is 1.05e+03.
         texts = [f"{float(f'{value:.{digits}g}'):.15g}" for value in numbers]
-        if len(set(texts)) == len(texts):
+        if len(set(texts)) == len(set(numbers)):
             break
     return texts

@@ -94,7 +94,7 @@ def _range(kind: str, ends: Sequence[float], values: Sequence[float]) -> list[fl
         # The upper end of whole ranges without a step is left out.
         least, most = math.floor(least), math.ceil(most) + (0 if step else 1)
     elif not step:
-        least, most = _rounded(least, most)
+        least, most = _rounded(least, most, values)
     if step:
         least, most = math.floor(least / step[0]) * step[0], math.ceil(most / step[0]) * step[0]
         if "int" not in kind:
@@ -104,17 +104,10 @@ def _range(kind: str, ends: Sequence[float], values: Sequence[float]) -> list[fl
     return [least, most, *step] if least < most else list(ends)
 
 
-def _rounded(least: float, most: float) -> tuple[float, float]:
-    """Return the ends of a range in few digits, and not within it: three of each, and two of how wide it is."""
-    if not least < most:
-        return least, most
-    width = math.floor(math.log10(most - least)) - 1
-    ends = []
-    for value, way in ((least, math.floor), (most, math.ceil)):
-        own = math.floor(math.log10(abs(value))) - 2 if value else width
-        unit = min(own, width)
-        # Divided where the unit is below one, as 10 ** -3 is not a thousandth in binary.
-        scaled = value * 10**-unit if unit < 0 else value / 10**unit
-        whole = way(round(scaled, 6))
-        ends.append(whole / 10**-unit if unit < 0 else float(whole * 10**unit))
-    return ends[0], ends[1]
+def _rounded(least: float, most: float, values: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of a range in as few digits as leave no value out, three at least."""
+    for digits in range(3, 17):
+        low, high = (float(f"{end:.{digits}g}") for end in (least, most))
+        if low <= min(values) and max(values) <= high:
+            return low, high
+    return min(least, *values), max(most, *values)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -230,3 +231,12 @@ def register_test_envs() -> None:
         if env_id not in gym.registry:
             limit = 50 if env_id == "TestNotDrawable-v0" else None
             gym.register(env_id, entry_point, max_episode_steps=limit)
+
+
+@contextlib.contextmanager
+def registered(env_id: str, env_class: type[gym.Env[Any, Any]]) -> Iterator[None]:
+    """Have a class of a test's own registered while the block lasts."""
+    register: Any = gym.register
+    register(env_id, env_class)
+    yield
+    del gym.registry[env_id]

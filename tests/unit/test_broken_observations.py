@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from policy_factory import registered
 
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.evaluate import evaluate_policy, play_episode
@@ -57,10 +58,8 @@ class Breaks(gym.Env[Any, Any]):
 
 @pytest.fixture(autouse=True)
 def _env() -> Iterator[None]:
-    register: Any = gym.register
-    register(ENV, Breaks)
-    yield
-    del gym.registry[ENV]
+    with registered(ENV, Breaks):
+        yield
 
 
 def policy() -> RandomPolicy:

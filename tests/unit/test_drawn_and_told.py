@@ -62,6 +62,7 @@ def test_env_steps_are_told_as_such_everywhere_in_a_comparison() -> None:
         ([0.98, 0.9848, 0.9895], ["0.98", "0.985", "0.99"]),
         ([1000.0, 1050.0, 1100.0], ["1000", "1050", "1100"]),
         ([0.5, 0.5], ["0.5", "0.5"]),
+        ([1 / 3, 1 / 3], ["0.33", "0.33"]),
     ],
 )
 def test_edges_of_bins_are_told_apart(numbers: list[float], texts: list[str]) -> None:
@@ -81,7 +82,7 @@ def test_parts_of_whole_numbers_are_told_by_those_in_them() -> None:
 
 
 def test_the_time_before_a_resume_is_not_counted_again() -> None:
-    """The first trained for 100 s, then for 10 more when it was resumed at 1,000; the other from 500 on."""
+    """The first trained for 100 s, then for 10 more when it was resumed at 1,000; the other from 1,020 on."""
 
     def record(index: int, time_s: float, started_at: float, ended_at: float) -> TrialRecord:
         return TrialRecord(

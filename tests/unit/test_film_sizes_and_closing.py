@@ -11,6 +11,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
+from policy_factory import registered
 
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.live import watch_episode
@@ -52,10 +53,8 @@ class Grows(gym.Env[Any, Any]):
 @pytest.fixture(autouse=True)
 def _env(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(Grows, "num_open", 0)
-    register: Any = gym.register
-    register(ENV, Grows)
-    yield
-    del gym.registry[ENV]
+    with registered(ENV, Grows):
+        yield
 
 
 def policy(num_actions: int = 2) -> ConstantPolicy:

@@ -188,7 +188,7 @@ LAYERS = {"layers": {"number": [1, 2], "sizes": {"choice": [8]}}}
     [
         ({"power_of_two": [16, 1024]}, [64, 128], {"power_of_two": [32, 256]}),
         ({"power_of_two": [16, 64]}, [16], {"power_of_two": [16, 32]}),
-        ({"one_minus_loguniform": [0.9, 0.9999]}, [0.99, 0.99], {"one_minus_loguniform": [0.9762, 0.995]}),
+        ({"one_minus_loguniform": [0.9, 0.9999]}, [0.99, 0.99], {"one_minus_loguniform": [0.9763, 0.995]}),
         (LAYERS, [[8]], LAYERS),
     ],
 )

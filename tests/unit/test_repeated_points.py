@@ -6,7 +6,7 @@ from spec_errors import MINIMAL
 
 from tune_jobs.plan.points import repeated_points_notes
 from tune_jobs.spec.domains import Grid
-from tune_jobs.spec.draws import draw_points
+from tune_jobs.spec.draws import draw_points, num_points
 from tune_jobs.spec.file import load_spec
 
 REPLAY = ["uniform", "prioritized"]
@@ -44,3 +44,17 @@ def test_combinations_of_grids_in_which_nothing_random_acts_are_told_to_be_repea
     # What depends on a random value may act with one sample and not with another.
     chained = {**space, "n_step": {"choice": [1, 2]}, "tau": {"uniform": [0.1, 0.9], "when": {"n_step": 2}}}
     assert notes(chained, 3) == []
+
+
+def test_points_are_counted_no_further_than_a_note_needs() -> None:
+    """All of a space whose values depend on each other would take seconds, and half a gigabyte, at each plan."""
+    when = {"replay": "prioritized"}
+    values = [0.05 * index for index in range(1, 13)]
+    space: dict[str, Any] = {"replay": {"choice": REPLAY}} | {
+        name: {"choice": values, "when": when} for name in ("prioritized_alpha", "prioritized_beta", "tau", "lr")
+    }
+    spec = load_spec({**MINIMAL, "algorithm": "dqn", "space": space})
+    grids = {name: Grid(grid=getattr(domain, "choice", ()), when=domain.when) for name, domain in spec.space.items()}
+    assert 50 <= num_points(grids, 1, most=50) < 50 * 12
+    assert num_points(grids, 1, most=500_000) == 1 + 12**4
+    assert notes(space, 50) == []

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from policy_factory import registered
 
 from policies.acting.evaluate import check_policy, evaluate_policy
 from policies.acting.live import watch_episode
@@ -56,10 +57,8 @@ class Choosing(gym.Env[Any, Any]):
 
 @pytest.fixture(autouse=True)
 def _env() -> Iterator[None]:
-    register: Any = gym.register
-    register(ENV, Choosing)
-    yield
-    del gym.registry[ENV]
+    with registered(ENV, Choosing):
+        yield
 
 
 def random_policy(**env_args: Any) -> RandomPolicy:

@@ -44,7 +44,8 @@ def repeated_points_notes(spec: SweepSpec) -> list[str]:
     if spec.scheduler.is_population:
         return []
     again = "; seeds_per_point trains each again, and averages over the seeds."
-    num_different, num_tried = _num_different(spec.space), num_points_of(spec)
+    num_tried = num_points_of(spec)
+    num_different = _num_different(spec.space, num_tried)
     if num_different is not None and num_different < num_tried:
         different = counted(num_different, "different point")
         return [f"The space has {different}, so some of the {num_tried} that num_samples gives are the same{again}"]
@@ -57,12 +58,13 @@ def repeated_points_notes(spec: SweepSpec) -> list[str]:
     return [f"{without}, so num_samples {spec.num_samples} repeats what has them{again}"] if fixed else []
 
 
-def _num_different(space: Mapping[str, Domain]) -> int | None:
-    """Return the number of different points of a space, up to a million or somewhat more; None: it has ranges."""
+def _num_different(space: Mapping[str, Domain], most: int) -> int | None:
+    """Return the number of different points of a space, or `most` or more where there are more; None: it has ranges."""
     listed = {name: domain for name, domain in space.items() if isinstance(domain, Listed)}
     if len(listed) < len(space):
         return None
-    return num_points({name: Grid(grid=domain.values, when=domain.when) for name, domain in listed.items()}, 1)
+    grids = {name: Grid(grid=domain.values, when=domain.when) for name, domain in listed.items()}
+    return num_points(grids, 1, most=most)
 
 
 def num_trials_of(

@@ -15,10 +15,10 @@ MOST_COMBINATIONS = 1_000_000
 """Of grids with conditions, more than these are not counted; no sweep can have as many."""
 
 
-def num_points(space: Mapping[str, Domain], num_samples: int) -> int:
-    """Return how many points `draw_points` returns; beyond a million it may return less."""
+def num_points(space: Mapping[str, Domain], num_samples: int, *, most: int = MOST_COMBINATIONS) -> int:
+    """Return how many points `draw_points` returns; beyond so many combinations it may return less, but not below."""
     # Grids that no condition connects multiply, so that only those of one group are listed together.
-    return num_samples * math.prod(len(_acting_indexes(space, group)) for group in _connected(_grids(space)))
+    return num_samples * math.prod(len(_acting_indexes(space, group, most)) for group in _connected(_grids(space)))
 
 
 def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) -> list[dict[str, Any]]:
@@ -106,7 +106,9 @@ def _acting_combinations(space: Mapping[str, Domain], names: list[str]) -> list[
     return [{name: grids[name].values[indexes[name]] for name in names if name in indexes} for indexes in found]
 
 
-def _acting_indexes(space: Mapping[str, Domain], names: list[str]) -> list[dict[str, int]]:
+def _acting_indexes(
+    space: Mapping[str, Domain], names: list[str], most: int = MOST_COMBINATIONS
+) -> list[dict[str, int]]:
     """Return the same in any order, as the places of values in their grids; of too many, some of their beginnings."""
     grids, conditions = _grids(space), Conditions(space)
     found: list[dict[str, int]] = [{}]
@@ -117,7 +119,7 @@ def _acting_indexes(space: Mapping[str, Domain], names: list[str]) -> list[dict[
                 known = {other: grids[other].values[index] for other, index in indexes.items()}
                 acts = name in conditions.acting(known)
                 grown += [indexes | {name: index} for index in range(len(grids[name].values))] if acts else [indexes]
-                if len(grown) >= MOST_COMBINATIONS:
+                if len(grown) >= most:
                     return grown
             found = grown
     return found

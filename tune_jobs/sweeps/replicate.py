@@ -57,14 +57,14 @@ def run_race(
         race = race_named(record, known) if known is not None else None
         # Only now, as the modules that the sweep's environment may need are allowed by the run.
         ranking = ranking_of(store)
+        contenders = different_points(ranking)
         if race is None:
-            contenders = different_points(ranking)
             _check(store, contenders)
             last = last_race(record) if name is None else None
             if last is not None and _is_as_large(last, contenders, top, seeds):
                 race = last if was_cut or last.next_points(ranking) else None
         if race is None:
-            race = _new(record, different_points(ranking), top, seeds, name)
+            race = _new(record, contenders, top, seeds, name)
         known = race.name
         return round_of(record, race, race.next_points(ranking))
 
