@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from policies.parents import is_gone
-from tune_jobs.ray_tune import forked_worker
+from tune_jobs.ray_tune import forked_worker, forks
 from tune_jobs.ray_tune.forks import begun_ahead, fork_server
 
 pytestmark = [pytest.mark.ray, pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")]
@@ -161,6 +161,17 @@ def test_who_has_ended_is_announced_nothing() -> None:
         assert found is not None
         found.close()
         found.announce({})
+
+
+def test_one_that_still_imports_when_it_is_ended_ends_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "slow_to_import.py").write_text("import time; time.sleep(60)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(forks, "_EARLY", ("slow_to_import",))
+    monkeypatch.setattr(forks, "_PATIENCE_S", 0.2)
+    before = children()
+    with fork_server():
+        assert len(children()) == len(before) + 1
+    assert children() == before
 
 
 def test_one_that_was_begun_ahead_is_the_one_that_is_used_and_lives_as_long(tmp_path: Path) -> None:

@@ -72,8 +72,12 @@ class ForkServer:
             self._process.kill()
         with contextlib.suppress(OSError):
             self._process.stdin.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        try:
             self._process.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            # On a busy machine it may still import, and what it has forked ends with it either way.
+            self._process.kill()
+            self._process.wait()
         self._folder.cleanup()
 
 
