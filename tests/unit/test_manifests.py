@@ -1,5 +1,6 @@
 """A manifest covers every file of its checkpoint, and itself."""
 
+import errno
 import functools
 import json
 import shutil
@@ -10,7 +11,9 @@ from typing import Any
 import pytest
 from trial_runs import Trial
 
-from policies.errors import CheckpointError
+from policies.errors import CheckpointError, NotFoundError
+from policies.files import sha256_file
+from tune_jobs.store import manifests
 from tune_jobs.store.manifests import read_manifest, verify_checkpoint
 from tune_jobs.store.record_files import seal
 
@@ -136,3 +139,32 @@ def test_a_manifest_of_format_1_is_read(old_checkpoint: Path) -> None:
         200,
         12.0,
     )
+
+
+def test_a_checkpoint_that_is_removed_while_it_is_verified_is_not_there(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A trial that runs keeps only its last ones, and others may read them."""
+
+    def hashed_at_last(path: Path) -> str:
+        digest = sha256_file(path)
+        shutil.rmtree(checkpoint, ignore_errors=True)
+        return digest
+
+    monkeypatch.setattr(manifests, "sha256_file", hashed_at_last)
+    with pytest.raises(NotFoundError, match=f"No checkpoint folder at {checkpoint}") as raised:
+        verify_checkpoint(checkpoint)
+    assert not isinstance(raised.value, CheckpointError)
+
+
+def test_a_file_that_cannot_be_read_now_is_named_and_need_not_be_damaged(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreadable(path: Path) -> str:
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(manifests, "sha256_file", unreadable)
+    with pytest.raises(CheckpointError, match=r"cannot be read: Input/output error, .*engine.json") as raised:
+        verify_checkpoint(checkpoint)
+    # What tells it from a damaged one, which is set aside.
+    assert isinstance(raised.value.__cause__, OSError)

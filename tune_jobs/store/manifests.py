@@ -70,9 +70,22 @@ def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
     """Check every file of a checkpoint against its manifest, before anything in it is read.
 
     Raises:
-        NotFoundError: The folder is missing.
-        CheckpointError: A file is missing, differs in size or hash, or is not in the manifest; the message names it.
+        NotFoundError: The folder is missing, or was removed meanwhile: the trial keeps only its last ones.
+        CheckpointError: A file is missing, cannot be read, differs in size or hash, or is not in the manifest; the
+            message names it.
     """
+    try:
+        return _verified(checkpoint)
+    except (OSError, CheckpointError) as error:
+        if not checkpoint.is_dir():
+            raise _no_folder(checkpoint) from None
+        if isinstance(error, CheckpointError):
+            raise
+        text = f"Checkpoint {checkpoint} cannot be read: {error.strerror}, {error.filename}."
+        raise CheckpointError(text, "Use another checkpoint of the trial.") from error
+
+
+def _verified(checkpoint: Path) -> CheckpointRecord:
     record, data = _read(checkpoint)
     files = _described_files(checkpoint / MANIFEST, data.get("files"))
     found = _files_in(checkpoint)
@@ -115,7 +128,7 @@ def files_of(checkpoint: Path) -> dict[str, Path]:
 
 def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
     if not checkpoint.is_dir():
-        raise NotFoundError(f"No checkpoint folder at {checkpoint}.", "List a sweep's with `tune-jobs trials SWEEP`.")
+        raise _no_folder(checkpoint)
     path = checkpoint / MANIFEST
     refuse_link(path)
     if not path.is_file():
@@ -127,6 +140,10 @@ def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
     if not isinstance(engine := data.get("engine"), str | None):
         raise CheckpointError(f"{path}: engine is {_shown(engine)}, not a name.", _HINT)
     return parse_record(data, path, CheckpointRecord, "checkpoint manifest"), data
+
+
+def _no_folder(checkpoint: Path) -> NotFoundError:
+    return NotFoundError(f"No checkpoint folder at {checkpoint}.", "List a sweep's with `tune-jobs trials SWEEP`.")
 
 
 def _described_files(manifest: Path, files: Any) -> dict[str, tuple[int, str]]:
