@@ -41,7 +41,8 @@ def former(spec: SchedulerSpec, max_env_steps: int) -> Any:
     grace = spec.grace_env_steps
     common = {"time_attr": "num_env_steps", "metric": "score", "mode": "max"}
     if spec.type == "asha":
-        made = _ASHA(max_t=max_env_steps, grace_period=grace, reduction_factor=spec.reduction_factor, **common)
+        settings = {"max_t": max_env_steps, "grace_period": grace, "reduction_factor": spec.reduction_factor}
+        made = _ASHA(stop_last_trials=False, **settings, **common)
     else:
         made = _Median(grace_period=grace, **common)
     made.grace_env_steps = grace

@@ -58,6 +58,18 @@ def test_evaluations_that_are_further_apart_than_milestones_keep_nobody_waiting(
     assert list(rule.in_turn()) == ["t0007"]
 
 
+@pytest.mark.parametrize("factor", [1.2, 1.5, 1.9])
+def test_each_halving_comes_later_than_the_one_before_also_if_few_are_ended(factor: float) -> None:
+    rule = HyperBand(100, 2_000, factor)
+    rule.begins("t0000")
+    milestones = []
+    while (milestone := rule.next_milestone("t0000")) is not None:
+        milestones.append(milestone)
+        reach(rule, 0, milestone, 1.0)
+    assert len(milestones) > 3
+    assert milestones == sorted(set(milestones))
+
+
 def test_those_that_wait_do_not_wait_for_one_that_ended_by_itself() -> None:
     rule = made(8)
     for number in range(8):

@@ -9,7 +9,7 @@ import pytest
 from former_schedulers import FakedController, FakedTrial, former
 
 from tune_jobs.ray_tune.early_stopping import build_scheduler, build_tune_scheduler
-from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Standing
+from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, NobodyWaits, Scheduler, Standing
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
 from tune_jobs.spec.scheduler import SchedulerSpec, SchedulerType
 
@@ -175,3 +175,31 @@ def test_a_trial_that_tune_ends_before_its_first_report_is_compared_with_none() 
         judge.on_trial_add(None, FakedTrial("t0001"))
         told = {"num_env_steps": 1_000, "score": 1.0, "evaluated": True}
         assert judge.on_trial_result(FakedController(), FakedTrial("t0001"), told) == "CONTINUE"
+
+
+def asha() -> Scheduler:
+    """Rungs at 2,500, 7,500 and 22,500 env steps."""
+    return build_scheduler(SchedulerSpec(type="asha"), 50_000)
+
+
+def told(rule: Scheduler, name: str, *evaluations: tuple[int, float]) -> list[Decision | CopyFrom]:
+    rule.begins(name)
+    return [rule.reached(Standing(name, steps, score, evaluated=True), NobodyWaits()) for steps, score in evaluations]
+
+
+def test_nobody_is_compared_at_a_rung_with_what_a_trial_that_passed_it_unevaluated_scored_later() -> None:
+    rule = asha()
+    assert told(rule, "seldom", (20_480, 100.0), (40_960, 300.0)) == [Decision.GO_ON] * 2
+    rule.ended(Standing("seldom", 50_000, 450.0, evaluated=True))
+    # Better than the other wherever both are known, and evaluated early.
+    assert told(rule, "often", (2_560, 60.0), (7_680, 120.0), (23_040, 450.0)) == [Decision.GO_ON] * 3
+
+
+def test_the_last_score_of_a_trial_that_failed_is_none_where_it_failed() -> None:
+    rule = asha()
+    for number in range(4):
+        told(rule, f"t{number}", *((steps, 450.0) for steps in (2_500, 7_500, 20_000)))
+        rule.ended(Standing(f"t{number}", 23_000, 450.0, evaluated=False))
+    evaluations = ((2_500, 450.0), (7_500, 450.0), (20_000, 451.0), (23_000, 430.0))
+    # The first of all that was evaluated there.
+    assert told(rule, "t4", *evaluations) == [Decision.GO_ON] * 4

@@ -77,7 +77,13 @@ class RayRule:
         return _DECISIONS[told]
 
     def ended(self, standing: Standing) -> None:
-        """Tell Ray's rule of a trial's end."""
+        """Tell Ray's rule of a trial's end, and of its score there if it has one.
+
+        A trial that failed has the score of an evaluation before, which is none at the env steps at which it failed.
+        """
+        if not standing.evaluated:
+            self._rule.on_trial_remove(None, _Named(standing.trial_id))
+            return
         self._rule.on_trial_complete(None, _Named(standing.trial_id), _result(standing))
 
 
@@ -103,7 +109,12 @@ def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
     if spec.type == "asha":
         # Li et al. 2020.
         rung = min(grace, max_env_steps)
-        asha = ASHAScheduler(max_t=max_env_steps, grace_period=rung, reduction_factor=spec.reduction_factor, **common)
+        # By default, Ray's files later scores of a trial at the rungs that it has passed between two evaluations, and
+        # those whose evaluations are closer are compared with them. That `max_t` ends a trial is not needed here.
+        asha = ASHAScheduler(
+            max_t=max_env_steps, grace_period=rung, reduction_factor=spec.reduction_factor, stop_last_trials=False,
+            **common,
+        )  # fmt: skip
         return RayRule(asha, grace)
     if spec.type == "median":
         # Golovin et al. 2017.

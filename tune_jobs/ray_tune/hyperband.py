@@ -163,7 +163,9 @@ class HyperBand:
             if bracket.num_halvings:
                 bracket.num_halvings -= 1
                 bracket.num_places = math.ceil(bracket.num_places / self._factor)
-                bracket.milestone = int(min(bracket.milestone * self._factor, self._max_periods))
+                # Rounded down, 1.5 grace periods would be 1 again, at which all halvings would be made at once.
+                later = max(int(bracket.milestone * self._factor), bracket.milestone + 1)
+                bracket.milestone = min(later, self._max_periods)
                 ranked = sorted(bracket.live, key=lambda name: _score(bracket.live[name]))
                 for name in ranked[: -bracket.num_places]:
                     self._remove(bracket, name)
