@@ -26,6 +26,10 @@ from iteration i > 0 uses new numbers, because only packs save the state of thei
 | [seed, i, 1] | packs: environments |
 | [seed, i, 2] | packs: what a member draws that went on from a copy of another's checkpoint |
 
+Zeros at the end of an entropy change nothing, so [seed, 0] is the seed itself: until its first restart, a member of a
+pack draws from the numbers that Gymnasium seeds its first sub-environment with, which are used for other things there.
+Other numbers would be better, and would change the result of every pack.
+
 Random policies in evaluations draw from [the episode's seed]. Resampling in reports, and trial steps of environments
 that are measured, use a fixed seed. An environment's use of its seed is up to Gymnasium.
 """
