@@ -187,7 +187,7 @@ _DQN: tuple[ForeignName, ...] = (
     ForeignName(RLLIB, "dueling", ("dueling",)),
     ForeignName(RLLIB, "n_step", ("n_step",), "a number; RLlib may also draw it from a range"),
     ForeignName(RLLIB, "td_error_loss_fn", ("td_loss",)),
-    ForeignName(RLLIB, "adam_epsilon", ("optimizer_epsilon",)),
+    ForeignName(RLLIB, "adam_epsilon", ("optimizer_epsilon",), "RLlib's new API stack leaves it at 1e-08"),
     ForeignName(RLLIB, "epsilon", ("epsilon_initial", "epsilon_decay", "epsilon_final"), _EPSILON),
     ForeignName(RLLIB, "min_sample_timesteps_per_iteration", ("env_steps_per_iteration",)),
     ForeignName(RLLIB, "hiddens", ("hidden_sizes",), "ours are all hidden layers; the heads have none of their own"),
