@@ -10,7 +10,8 @@ from tune_jobs.service.database.opening import open_database
 from tune_jobs.service.job_files import SERVICE_FOLDER
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
-from tune_jobs.service.supervisor import Supervisor, Surroundings
+from tune_jobs.service.supervisor import Supervisor
+from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.store.opening import open_storage
 
 

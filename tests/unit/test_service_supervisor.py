@@ -25,7 +25,8 @@ from tune_jobs.service.job_files import KEPT_S, SERVICE_FOLDER, Ended, Holder, J
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver
-from tune_jobs.service.supervisor import Supervisor, Surroundings
+from tune_jobs.service.supervisor import Supervisor
+from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from policies.errors import TuneJobsError
 from tune_jobs.service.database.opening import reason_of
 
 FIRST_WAIT_S, MOST_WAIT_S = 60.0, 3_600.0
@@ -63,9 +64,11 @@ class Outages:
                 return
             outage.tell_at = now + outage.wait_s
             outage.wait_s = min(MOST_WAIT_S, 2.0 * outage.wait_s)
-        # Where a database is away, the lines of the code that asked it tell nothing.
-        why = f"{what}: {reason_of(error)}" if isinstance(error, SQLAlchemyError) else what
-        trace = None if is_database else error
+        # Where a database is away, or an error was raised on purpose, the lines of the code tell nothing.
+        said = reason_of(error) if isinstance(error, SQLAlchemyError) else None
+        if isinstance(error, TuneJobsError):
+            said = error.message.rstrip(".")
+        why, trace = (what, error) if said is None else (f"{what}: {said}", None)
         if is_new:
             _log.error("%s. It is tried again.", why, exc_info=trace)
         else:

@@ -30,7 +30,8 @@ from tune_jobs.service.state_metrics import EnvSteps, StateCollector
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.service.storage_health import StorageHealth
 from tune_jobs.service.submitting import Submitter
-from tune_jobs.service.supervisor import Supervisor, Surroundings
+from tune_jobs.service.supervisor import Supervisor
+from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.service.telling import Teller
 from tune_jobs.service.watching import Watching
 from tune_jobs.store.contract import Storage

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
-from policies.errors import CannotRunError, CheckpointError, NotFoundError, TuneJobsError
+from policies.errors import CheckpointError, NotFoundError, TuneJobsError
+from tune_jobs.service.storage_health import is_of_store
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.store.patience import impatient
@@ -92,7 +93,7 @@ class Statuses:
 
         Raises:
             NotFoundError: There is none, it is damaged, or its name is nothing that JSON and addresses can have.
-            CannotRunError: Its store does not answer.
+            CannotRunError: Its store does not answer, or its lock cannot be read.
         """
         # Whoever asks for it holds the lock meanwhile, and the next one waits for that.
         with impatient():
@@ -153,10 +154,10 @@ class Statuses:
         for sweep in sweeps:
             try:
                 found.append(self.see(sweep.name))
-            except CannotRunError:
-                # Without those that it has, a list would say that they are gone.
-                raise
             except TuneJobsError as error:
+                if is_of_store(self._storage, error):
+                    # Without those that it has, a list would say that they are gone.
+                    raise
                 leave_out(error)
         return found
 

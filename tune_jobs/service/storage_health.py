@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from policies.errors import TuneJobsError
+from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.store.contract import Storage
 from tune_jobs.store.patience import impatient
 from tune_jobs.store.urls import is_url
@@ -14,6 +14,11 @@ from tune_jobs.store.urls import is_url
 _EVERY_S = 5.0
 """Seconds for which an answer is believed: anybody may ask, and a store wants money for each request."""
 _NO_SWEEP = ".health"
+
+
+def is_of_store(storage: Storage, error: TuneJobsError) -> bool:
+    """Whether an error in looking at a sweep is its store's, and so about all: a folder's is about that sweep alone."""
+    return isinstance(error, CannotRunError) and is_url(storage.place)
 
 
 class StorageHealth:

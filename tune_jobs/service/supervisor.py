@@ -12,18 +12,17 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from policies.errors import TuneJobsError
 from tune_jobs.service.job_files import JobFiles, held_jobs, remove_ended
 from tune_jobs.service.jobs import Job, Outcome
-from tune_jobs.service.logs import LogFormat
 from tune_jobs.service.outages import Outages
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.spare import Driver, memory_of_tree
+from tune_jobs.service.storage_health import is_of_store
+from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.store.contract import Storage, Sweep
 
 _log = logging.getLogger(__name__)
@@ -32,23 +31,6 @@ TICK_S = 0.25
 MAX_ATTEMPTS = 5
 """How many driver processes of one job may die, one after the other, before it counts as failed."""
 _LOOKING = "The queue can't be looked at"
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """Where jobs run."""
-
-    working_folder: Path
-    service_folder: Path
-    address: str | None
-    """The Ray cluster; None: this machine."""
-    num_cpus: float
-    modules: tuple[str, ...]
-    """Modules that specs may name; the operator's choice."""
-    log_format: LogFormat = "text"
-    """Of what processes without a job say, on this one's standard error."""
-    wait_for_nodes: float = 0.0
-    """How many seconds a job waits for nodes of the cluster that can hold one trial, if it does not say it itself."""
 
 
 class Supervisor:
@@ -185,11 +167,15 @@ class Supervisor:
         ours = {holder.sweep for holder in held_jobs(self._where.service_folder)}
         last = {job.sweep: job for job in self._queue.jobs("ended")}
         for sweep in self._storage.sweeps():
-            if sweep.name in known or (sweep.is_driven() and sweep.name not in ours):
+            if sweep.name in known:
                 continue
             try:
+                if sweep.is_driven() and sweep.name not in ours:
+                    continue
                 record = sweep.read_record()
             except TuneJobsError as error:
+                if is_of_store(self._storage, error):
+                    raise
                 _log.warning("Sweep %s is left alone: %s", sweep.name, error, extra={"sweep": sweep.name})
                 continue
             if record.state in ("created", "running") and not _is_over(last.get(sweep.name), record.created_at):
@@ -213,7 +199,8 @@ class Supervisor:
         for pid in [pid for pid, child in self._children.items() if child.poll() is not None]:
             del self._children[pid]
         for job in self._queue.jobs("running"):
-            self._look_at(job)
+            with self._apart(job.sweep):
+                self._look_at(job)
         # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
         free = {name for name in {job.sweep for job in self._queue.jobs("waiting")} if self._may_run(name)}
         while not self._draining.is_set():
@@ -224,8 +211,23 @@ class Supervisor:
         self._mind_spare()
 
     def _may_run(self, name: str) -> bool:
-        """Whether nobody else drives a sweep, such as a person with a terminal."""
-        return not self._sweep(name).is_driven()
+        """Whether nobody else drives a sweep, such as a person with a terminal; one of which that isn't known waits."""
+        with self._apart(name):
+            return not self._sweep(name).is_driven()
+        return False
+
+    @contextlib.contextmanager
+    def _apart(self, name: str) -> Iterator[None]:
+        """Let what is wrong with one sweep, such as a lock that can't be read, keep no other one from running."""
+        what = f"Sweep {name} can't be looked at"
+        try:
+            yield
+        except TuneJobsError as error:
+            if is_of_store(self._storage, error):
+                raise
+            self._outages.failed(what, error)
+        else:
+            self._outages.worked(what)
 
     def _look_at(self, job: Job) -> None:
         files = self._files(job)
