@@ -28,7 +28,7 @@ class Job(_Answer):
     arguments: dict[str, Any]
     owner: str
     priority: int
-    num_cpus: float
+    num_cpus: float | None = Field(description="None: an older service on a cluster doesn't say.")
     state: str = Field(description="creating, waiting, running or ended.")
     outcome: str | None = Field(description="completed, failed, stopped or cancelled; None: it has not ended.")
     message: str | None = Field(description="Why it failed.")

@@ -6,6 +6,7 @@ drained. Each change is one transaction, so a service that is killed leaves eith
 
 from __future__ import annotations
 
+import math
 import time
 import uuid
 from collections import Counter
@@ -299,4 +300,6 @@ def _job(connection: Connection, job_id: int) -> Job:
 
 
 def _as_job(row: RowMapping) -> Job:
-    return Job.model_validate(dict(row))
+    # Earlier versions wrote infinity for a cluster's, which JSON has not.
+    num_cpus = row["num_cpus"] if math.isfinite(row["num_cpus"]) else 1.0
+    return Job.model_validate({**row, "num_cpus": num_cpus})

@@ -80,8 +80,8 @@ class StateCollector(Collector):
             "tune_jobs_queue_oldest_wait_seconds", "How long the oldest job that waits has waited.", load.waited_s
         )
         yield _gauge("tune_jobs_cpus_used", "CPUs that running jobs take.", load.num_cpus)
-        if self._supervisor.num_cpus < float("inf"):
-            yield _gauge("tune_jobs_cpus", "CPUs that running jobs share.", self._supervisor.num_cpus)
+        if self._supervisor.where.num_cpus < float("inf"):
+            yield _gauge("tune_jobs_cpus", "CPUs that running jobs share.", self._supervisor.where.num_cpus)
         yield _gauge("tune_jobs_drivers", "Processes that drive sweeps.", self._supervisor.num_drivers())
 
     def _sweeps(self) -> Iterator[Metric]:

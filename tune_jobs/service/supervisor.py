@@ -142,9 +142,9 @@ class Supervisor:
         return sum(self._files(job).is_run() for job in self._queue.jobs("running"))
 
     @property
-    def num_cpus(self) -> float:
-        """CPUs that running sweeps share."""
-        return self._where.num_cpus
+    def where(self) -> Surroundings:
+        """Where jobs run."""
+        return self._where
 
     # -- the queue
 
@@ -160,7 +160,7 @@ class Supervisor:
             if job.state != "creating":
                 continue
             if self._storage.sweep(job.sweep).exists():
-                self._queue.created(job.id, num_cpus=self._where.num_cpus)
+                self._queue.created(job.id, num_cpus=self._where.unplanned_cpus)
             else:
                 self._queue.forget(job.id)
         known = {job.sweep for job in open_jobs}
@@ -179,7 +179,7 @@ class Supervisor:
                 _log.warning("Sweep %s is left alone: %s", sweep.name, error, extra={"sweep": sweep.name})
                 continue
             if record.state in ("created", "running") and not _is_over(last.get(sweep.name), record.created_at):
-                self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.num_cpus)
+                self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.unplanned_cpus)
         self._remove_files()
 
     def _run(self) -> None:

@@ -115,7 +115,7 @@ def _enqueue(  # noqa: PLR0917 (all of them are one request)
         if job.verb == verb and asked == dict(arguments) and not job.stop_requested:
             raise NotNowError(f"Sweep {name} has that job already: number {job.id}, which is {job.state}.")
     last = service.queue.jobs(sweep=name)
-    num_cpus = last[-1].num_cpus if last else service.supervisor.num_cpus
+    num_cpus = last[-1].num_cpus if last else service.supervisor.where.unplanned_cpus
     job, _ = service.queue.begin(name, verb, {**arguments, **wait}, owner=caller.name, num_cpus=num_cpus)
     service.supervisor.wake()
     return job

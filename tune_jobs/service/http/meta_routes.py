@@ -52,7 +52,7 @@ def me(service: TheService, caller: TheCaller) -> dict[str, Any]:
         "name": caller.name,
         "role": caller.role,
         "version": version("tune-jobs"),
-        "num_cpus": service.supervisor.num_cpus if service.config.address is None else None,
+        "num_cpus": service.supervisor.where.num_cpus if service.config.address is None else None,
         "address": service.config.address,
         "spare": service.supervisor.spare(),
     }
