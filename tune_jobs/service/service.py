@@ -6,8 +6,9 @@ import contextlib
 import fcntl
 import os
 import shlex
+import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sqlalchemy import Engine
@@ -56,6 +57,9 @@ class Service:
     derived: Derived
     metrics: Metrics
     env_steps: EnvSteps
+    adding: threading.RLock = field(default_factory=threading.RLock)
+    """Held from the look at what a sweep's jobs ask for until one is added: of those that come at once, each sees those
+    before it."""
 
 
 @contextlib.contextmanager

@@ -35,11 +35,11 @@ def stop(name: str, service: TheService, _: AChanger) -> list[Job]:
     seen = service.statuses.see(name)
     changed = service.queue.request_stop(name)
     sweep = service.storage.sweep(name)
-    if not changed and not seen.status.alive:
-        raise NotNowError(f"Sweep {name} neither waits nor runs: it is {seen.status.state}.")
-    if not changed:
+    if not any(job.state == "running" for job in changed) and sweep.is_driven():
         # Somebody runs it from a terminal.
         sweep.request_stop()
+    elif not changed:
+        raise NotNowError(f"Sweep {name} neither waits nor runs: it is {seen.status.state}.")
     service.supervisor.wake()
     return changed
 
@@ -62,12 +62,12 @@ def retry(name: str, service: TheService, caller: AChanger, wait_for_nodes: Wait
 @router.post("/extend", status_code=202)
 def extend(name: str, more: Extend, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Add points to a sweep, and run them."""
-    spec = stored_spec(service.statuses.see(name).status.sweep)
-    check_extendable(spec, more.num_samples)
-    jobs = _check_growth(service, name, Addition(num_samples=more.num_samples))
-    # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
-    arguments = {"to_num_samples": num_samples_after(spec, jobs) + more.num_samples}
-    return _enqueue(service, caller, name, "extend", arguments, wait_for_nodes)
+    check_extendable(stored_spec(service.statuses.see(name).status.sweep), more.num_samples)
+    with service.adding:
+        num_samples = _check_growth(service, name, Addition(num_samples=more.num_samples))
+        # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
+        arguments = {"to_num_samples": num_samples + more.num_samples}
+        return _enqueue(service, caller, name, "extend", arguments, wait_for_nodes)
 
 
 @router.post("/trials", status_code=202)
@@ -78,25 +78,28 @@ def inject(name: str, chosen: Inject, service: TheService, caller: AChanger, wai
     spec = stored_spec(record)
     # As the sweep writes it, so that a request that says the same in other words is known to be the same.
     point = new_point(record, spec, trials, chosen.point)
-    _check_growth(service, name, Addition(points=[point]))
-    return _enqueue(service, caller, name, "inject", {"point": point}, wait_for_nodes)
+    with service.adding:
+        _check_growth(service, name, Addition(points=[point]))
+        return _enqueue(service, caller, name, "inject", {"point": point}, wait_for_nodes)
 
 
 @router.post("/replicate", status_code=202)
 def replicate(name: str, race: Replicate, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Train the leading settings again with fresh seeds."""
     check_replicable(stored_spec(service.statuses.see(name).status.sweep))
-    _check_growth(service, name, Addition(top=race.top, seeds=race.seeds))
-    return _enqueue(service, caller, name, "replicate", race.model_dump(), wait_for_nodes)
+    with service.adding:
+        _check_growth(service, name, Addition(top=race.top, seeds=race.seeds))
+        return _enqueue(service, caller, name, "replicate", race.model_dump(), wait_for_nodes)
 
 
-def _check_growth(service: Service, name: str, more: Addition) -> list[Job]:
-    """Check the limits; return the sweep's jobs that wait or run."""
-    seen = service.statuses.see(name)
-    record = seen.status.sweep
+def _check_growth(service: Service, name: str, more: Addition) -> int:
+    """Check the limits; return how many samples the sweep has once its jobs that wait or run are done."""
+    # Before the sweep: what a job that ends in between has added is in there.
     jobs = service.queue.jobs("waiting", "running", sweep=name)
-    check_growth(service.config.limits, record, stored_spec(record), seen.trials.records, jobs=jobs, more=more)
-    return jobs
+    seen = service.statuses.see(name)
+    record, spec = seen.status.sweep, stored_spec(seen.status.sweep)
+    check_growth(service.config.limits, record, spec, seen.trials.records, jobs=jobs, more=more)
+    return num_samples_after(spec, jobs)
 
 
 def _enqueue(  # noqa: PLR0917 (all of them are one request)
@@ -109,13 +112,14 @@ def _enqueue(  # noqa: PLR0917 (all of them are one request)
 ) -> Job:
     service.statuses.see(name)
     wait = waiting_arguments(service.config, wait_for_nodes)
-    for job in service.queue.jobs("waiting", "running", sweep=name):
-        # How long it waits for nodes makes it no other job.
-        asked = {key: value for key, value in job.arguments.items() if key != "wait_for_nodes"}
-        if job.verb == verb and asked == dict(arguments) and not job.stop_requested:
-            raise NotNowError(f"Sweep {name} has that job already: number {job.id}, which is {job.state}.")
-    last = service.queue.jobs(sweep=name)
-    num_cpus = last[-1].num_cpus if last else service.supervisor.where.unplanned_cpus
-    job, _ = service.queue.begin(name, verb, {**arguments, **wait}, owner=caller.name, num_cpus=num_cpus)
+    with service.adding:
+        for job in service.queue.jobs("waiting", "running", sweep=name):
+            # How long it waits for nodes makes it no other job.
+            asked = {key: value for key, value in job.arguments.items() if key != "wait_for_nodes"}
+            if job.verb == verb and asked == dict(arguments) and not job.stop_requested:
+                raise NotNowError(f"Sweep {name} has that job already: number {job.id}, which is {job.state}.")
+        last = service.queue.jobs(sweep=name)
+        num_cpus = last[-1].num_cpus if last else service.supervisor.where.unplanned_cpus
+        job, _ = service.queue.begin(name, verb, {**arguments, **wait}, owner=caller.name, num_cpus=num_cpus)
     service.supervisor.wake()
     return job
