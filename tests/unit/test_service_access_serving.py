@@ -224,6 +224,15 @@ def test_options_that_cannot_be(run: RunCommand, tmp_path: Path, arguments: str,
     assert said in result.output
 
 
+@pytest.mark.parametrize(("command", "said"), [("echo 'hush", "No closing quotation"), ("echo \\", "No escaped char")])
+def test_a_command_that_is_none_is_refused(run: RunCommand, tmp_path: Path, command: str, said: str) -> None:
+    result = run("serve", "--port", 0, "--storage", tmp_path / "sweeps", "--run-command", command)
+    assert result.exit_code == 2, result.output
+    assert f"--run-command can't be split into a command and its arguments: {said}" in result.output
+    # They may be secrets.
+    assert "hush" not in result.output
+
+
 def test_a_proxy_is_one_address() -> None:
     with pytest.raises(SpecError, match=r"'10\.0\.0\.0/8' is no address"):
         ServiceConfig(storage=Path(), behind_proxy="10.0.0.0/8")

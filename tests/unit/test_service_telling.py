@@ -166,6 +166,33 @@ def test_a_command_that_fails_is_tried_again(engine: Engine, command: list[str],
     assert row["next_at"] is not None
 
 
+def test_a_message_that_can_not_even_be_made_keeps_no_other_from_being_told(
+    engine: Engine, receiver: Receiver, tmp_path: Path
+) -> None:
+    code = "import sys; open(sys.argv[1], 'w').write(sys.stdin.read())"
+    told = COMMAND + json.dumps([sys.executable, "-c", code, str(tmp_path / "got")])
+    odd = COMMAND + json.dumps(["/bin/true", "\0"])
+    clock = Clock()
+    teller = Teller(engine, [receiver.url, odd, told], secret="whsec_no base64", now=clock)
+    teller.tell("sweep.ended", {"sweep": "a"})
+    assert teller.send_due() == 1
+    assert (tmp_path / "got").exists()
+    with engine.begin() as connection:
+        rows = {row["target"]: row for row in connection.execute(select(messages)).mappings()}
+    assert rows[receiver.url]["error"].startswith("unexpected Error: ")
+    assert rows[odd]["error"] == "unexpected ValueError: embedded null byte"
+    for target in (receiver.url, odd):
+        assert (rows[target]["num_attempts"], rows[target]["next_at"]) == (1, clock.at + WAITS_S[0])
+
+
+@pytest.mark.parametrize("secret", ["whsec_not base64!", "whsec_aHVzaA", "whsec_", "whsec_häsh", "h\udcffsh"])
+def test_a_secret_that_signs_nothing_is_refused_and_not_repeated(secret: str, tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match="TUNE_JOBS_WEBHOOK_SECRET") as refused:
+        ServiceConfig(storage=tmp_path, webhook_secret=secret)
+    assert secret.removeprefix("whsec_") == "" or secret.removeprefix("whsec_") not in str(refused.value)
+    assert ServiceConfig(storage=tmp_path, webhook_secret="whsec_aHVzaA==").webhook_secret == "whsec_aHVzaA=="
+
+
 @pytest.mark.parametrize("url", ["", "file:///etc/passwd", "ftp://x", "javascript:x", "https://" + "x" * 3_000])
 def test_what_is_no_webhook_is_refused(url: str, tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="no URL of a webhook"):

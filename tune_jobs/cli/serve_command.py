@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from policies.errors import SpecError
 from tune_jobs.cli.base import json_option, storage_option
 from tune_jobs.cli.server import here_only
 from tune_jobs.process.first import leave_first_place
@@ -111,7 +112,7 @@ def serve(
         storage=storage_place(storage), host=host, port=port, address=address, database=database,
         modules=modules, envs=envs, spare_idle_s=spare_idle_s, drain_s=drain_s,
         webhooks=webhooks, webhook_secret=webhook_secret, stuck_s=stuck_s,
-        command=tuple(shlex.split(run_command or "")),
+        command=_split(run_command or ""),
         public_names=public_names, require_token=require_token, behind_proxy=behind_proxy,
         tls_certificate=tls_certificate, tls_key=tls_key, log_format=log_format, keep_audit_days=keep_audit_days,
         own_folder=absolute_folder(folder), wait_for_nodes=wait_for_nodes,
@@ -124,3 +125,14 @@ def serve(
         click.echo(told if as_json else f"serving {config.place} at {url}")
 
     run(config, say)
+
+
+def _split(command: str) -> tuple[str, ...]:
+    try:
+        return tuple(shlex.split(command))
+    except ValueError as error:
+        # Without the command, whose arguments may be secrets.
+        raise SpecError(
+            f"--run-command can't be split into a command and its arguments: {error}.",
+            "Close each quotation mark, and write one that is meant, or a backslash, with a backslash before it.",
+        ) from error

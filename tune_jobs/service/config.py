@@ -13,7 +13,7 @@ from tune_jobs.service.database.opening import password_in, sqlite_url
 from tune_jobs.service.events import STUCK_S
 from tune_jobs.service.job_files import own_database, own_folder
 from tune_jobs.service.logs import LogFormat
-from tune_jobs.service.telling import COMMAND, check_target, secrets_of
+from tune_jobs.service.telling import COMMAND, check_secret, check_target, secrets_of
 from tune_jobs.store.urls import folder_of, is_url
 from tune_jobs.sweeps.waiting import check_wait
 
@@ -110,6 +110,8 @@ class ServiceConfig:
         check_wait(self.address, self.wait_for_nodes)
         for url in self.webhooks:
             check_target(url)
+        if self.webhook_secret is not None:
+            check_secret(self.webhook_secret)
         for pattern in self.envs:
             try:
                 re.compile(pattern)

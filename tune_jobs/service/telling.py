@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 
 from sqlalchemy import Engine, delete, func, insert, or_, select, update
 
-from policies.errors import SpecError
+from policies.errors import SpecError, said_by
 from tune_jobs.service.database.tables import messages
 from tune_jobs.service.outages import Outages
 
@@ -75,6 +75,24 @@ def check_target(url: str) -> str:
     return url
 
 
+def check_secret(secret: str) -> str:
+    """Return what webhooks are signed with.
+
+    Raises:
+        SpecError: It gives no key; what it is, the error does not tell.
+    """
+    try:
+        why = "" if _key_of(secret) else "it is empty"
+    except ValueError as error:
+        why = said_by(error)
+    if why:
+        raise SpecError(
+            f"The secret of webhooks (--webhook-secret, TUNE_JOBS_WEBHOOK_SECRET) gives no key to sign with: {why}.",
+            f"Give it as the receiver shows it: after {_ENCODED} comes base64, up to its last `=`.",
+        )
+    return secret
+
+
 def told_target(target: str) -> str:
     """Return what may be told of a target: the path of a URL, and a command's arguments, may be secrets."""
     if target.startswith(COMMAND):
@@ -103,8 +121,13 @@ def signature(secret: str, message_id: str, timestamp: int, body: str) -> str:
         Standard Webhooks 1.0, "Webhook headers": HMAC-SHA256 of id, timestamp and body with dots between, base64.
     """
     signed = f"{message_id}.{timestamp}.{body}".encode()
-    key = base64.b64decode(secret.removeprefix(_ENCODED)) if secret.startswith(_ENCODED) else secret.encode()
-    return "v1," + base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
+    return "v1," + base64.b64encode(hmac.new(_key_of(secret), signed, hashlib.sha256).digest()).decode()
+
+
+def _key_of(secret: str) -> bytes:
+    if not secret.startswith(_ENCODED):
+        return secret.encode()
+    return base64.b64decode(secret.removeprefix(_ENCODED), validate=True)
 
 
 class Teller:
@@ -193,7 +216,10 @@ class Teller:
         for row in due:
             if self._end.is_set():
                 break
-            error = self._sent(row["id"], row["event"], row["target"], row["body"])
+            try:
+                error = self._sent(row["id"], row["event"], row["target"], row["body"])
+            except Exception as raised:  # noqa: BLE001 (whatever it is, the other messages have to be sent)
+                error = f"unexpected {type(raised).__name__}: {said_by(raised)}"[:500]
             attempts = row["num_attempts"] + 1
             arrived += error is None
             wait = None if error is None or attempts > len(WAITS_S) else WAITS_S[attempts - 1]
