@@ -131,3 +131,16 @@ def test_points_and_earlier_sweeps_are_checked_and_places_are_not_read(
     answer = client.post("/api/v1/sweeps", json={"spec": spec})
     assert answer.status_code == status, answer.text
     assert words in answer.json().get("detail", "")
+
+
+def test_a_name_that_its_number_would_make_too_long_is_refused(client: TestClient, service: Service) -> None:
+    """No version would read the record of such a sweep."""
+    for length, names in ((98, ["a" * 98, "a" * 98 + "-2"]), (99, ["a" * 99])):
+        for name in names:
+            answer = client.post("/api/v1/sweeps", json={"spec": FAKE, "default_name": "a" * length})
+            assert (answer.status_code, answer.json().get("sweep")) == (201, name)
+    answer = client.post("/api/v1/sweeps", json={"spec": FAKE, "default_name": "a" * 99})
+    assert answer.status_code == 422, answer.text
+    assert f"The sweep would be called '{'a' * 99}-2', as '{'a' * 99}' is taken" in answer.json()["detail"]
+    assert "Give another name" in answer.json()["hint"]
+    assert len(service.queue.jobs()) == len(service.storage.sweeps()) == 3

@@ -231,10 +231,19 @@ class Submitter:
         wanted = _wanted(submission, spec)
         if wanted is not None:
             return self._storage.new_sweep(check_sweep_name(wanted)).name
-        stem, number = check_sweep_name(submission.default_name or submission.preset or "sweep"), 1
-        while self._storage.is_taken(stem if number == 1 else f"{stem}-{number}"):
+        name = stem = check_sweep_name(submission.default_name or submission.preset or "sweep")
+        number = 1
+        while self._storage.is_taken(name):
             number += 1
-        return stem if number == 1 else f"{stem}-{number}"
+            try:
+                name = check_sweep_name(f"{stem}-{number}")
+            except SpecError as error:
+                raise SpecError(
+                    f"The sweep would be called '{stem}-{number}', as {stem!r} is taken; that is not allowed as a "
+                    "sweep's name.",
+                    f"Give another name. {error.hint}",
+                ) from error
+        return name
 
 
 def waiting_arguments(config: ServiceConfig, wait_for_nodes: float | None) -> dict[str, float]:
