@@ -10,12 +10,16 @@ from typing import Any, cast
 import pytest
 from fake_engine import FakeClock, FakeEngine, FakeEvaluator, make_task
 
+from analysis.best_records import CandidateRecord, ChoiceRecord
+from analysis.selection import policy_candidates
 from policies.acting.evaluate import Evaluator
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store import sweep_store, trial_store
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.adding import add_what_is_missing
 from tune_jobs.sweeps.drive import write_new
 from tune_jobs.training.trial_loop import TrialLoop
 
@@ -52,6 +56,28 @@ def make_sweep_folder(folder: Path, iterations: int = 6, **spec: Any) -> SweepSt
     changes = {"state": "completed", "started_at": 1.0, "ended_at": 2.0, "created_at": 0.0, "git_commit": None}
     store.write_record(record.model_copy(update=changes))
     return store
+
+
+def chosen(store: SweepStore, trial_id: str = "t0003", iteration: int = 6) -> dict[str, Any]:
+    """What the record of a best policy says of one that was chosen among all checkpoints that there are now."""
+    known = [item.checkpoint for item in policy_candidates(store.read_trials())]
+    winner = store.trial(trial_id).checkpoint(iteration)
+    candidates = tuple(
+        CandidateRecord(checkpoint=each, point={}, num_episodes=2, score=0.0, rejected_in=None if each == winner else 1)
+        for each in sorted(known, key=lambda each: each != winner)
+    )
+    choice = ChoiceRecord(candidates=candidates, num_known=len(known), num_evaluation_episodes=2)
+    return {"checkpoint": winner, "choice": choice}
+
+
+def extend_by_leaders(store: SweepStore) -> None:
+    """Add a point whose trials t0004 and t0005 score 400 and more, as `extend --no-finish` leaves a sweep of 4."""
+    record = store.read_record()
+    spec = stored_spec(record).model_copy(update={"num_samples": 3})
+    plan = add_what_is_missing(store, record, spec, MACHINE, None)
+    for trial in plan.trials[4:]:
+        train(store, trial.trial_id, 6, scores=lambda iteration: 400.0 + iteration)
+    store.write_record(store.read_record().model_copy(update={"state": "completed"}))
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from cutting_proxy import cutting_proxy
 from fake_sweeps import RunCommand
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
-from sweep_folders import make_sweep_folder
+from sweep_folders import extend_by_leaders, make_sweep_folder
 from test_service_downloads import make_finished
 
 from tune_jobs.cli import remote_runs
@@ -104,6 +104,23 @@ def test_a_resumed_sweep_ends_with_the_result_of_one_that_runs_here(run: RunComm
     assert document["artifacts"].keys() == {
         "policy", "before_mp4", "after_mp4", "after_gif", "before_after_mp4", "report",
     }  # fmt: skip
+
+
+def test_a_policy_of_before_is_not_the_result_of_an_extension(run: RunCommand, live: Live) -> None:
+    store = make_finished(live.storage / "mine")
+
+    def extended() -> bool:
+        extend_by_leaders(store)
+        return True
+
+    worker = during(lambda: Queue(live).finish("mine", until=extended))
+    result = run("--server", live.url, "extend", "mine", "--num-samples", 1, "--json", "--progress", "none")
+    worker.join(30)
+    assert result.exit_code == 3, result.output
+    document = json.loads(result.stdout)
+    assert (document["best"], document["finish_failed"]) == (None, True)
+    assert "chosen before the sweep was trained on" in document["why_no_best"]
+    assert "policy" not in document["artifacts"]
 
 
 def test_what_stops_a_sweep_there_ends_its_command_here(run: RunCommand, live: Live) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from fake_engine import FakeEngine
 from fake_sweeps import BEST
-from sweep_folders import make_sweep_folder
+from sweep_folders import chosen, make_sweep_folder
 from test_monitor import make_trial
 
 from tests.narrowing import present
@@ -120,8 +120,8 @@ def test_the_status_of_a_folder(tmp_path: Path) -> None:
 
 def test_the_best_of_a_finished_sweep_is_the_policy_that_was_chosen(tmp_path: Path) -> None:
     store = make_sweep_folder(tmp_path / "mine")
-    chosen = BEST.model_copy(update={"checkpoint": store.trial("t0001").checkpoint(6), "selection_score": 12.5})
-    store.write_best(chosen, FakeEngine().policy())
+    by_episodes = BEST.model_copy(update={**chosen(store, "t0001"), "selection_score": 12.5})
+    store.write_best(by_episodes, FakeEngine().policy())
     best = present(status(store.folder).best)
     assert (best.trial_id, best.iteration, best.score, best.point) == ("t0001", 6, 12.5, BEST.point)
     record = store.read_record()

@@ -8,8 +8,8 @@ import httpx2
 import pytest
 from fake_sweeps import run  # noqa: F401 (a fixture)
 from live_service import Live, live, serving, serving_a_viewer  # noqa: F401 (a fixture)
-from store_parts import make_best, make_checkpoint, make_iteration
-from sweep_folders import make_sweep_folder
+from store_parts import make_best, make_iteration
+from sweep_folders import chosen, make_sweep_folder
 
 from analysis.best_records import EvaluationRecord
 from analysis.best_so_far import best_so_far
@@ -102,7 +102,7 @@ def test_the_policy_to_deploy_is_told_with_its_interval(live: Live, stores: dict
         lengths=(1, 1, 1),
         threshold=190.0,
     )
-    stores["one"].write_best(make_best(checkpoint=make_checkpoint(6, trial_id="t0003"), confirmation=confirmed))
+    stores["one"].write_best(make_best(**chosen(stores["one"]), confirmation=confirmed))
     facts = {fact["title"]: fact["cells"] for fact in compared(live, "one", "two")["facts"]}
     one, two = facts["policy to deploy"]
     assert one == "195.0 (190.0 to 200.0 with 95 %) over 3 fresh episodes, solved"

@@ -15,8 +15,8 @@ import pytest
 from fake_sweeps import run  # noqa: F401 (a fixture)
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
 from policy_factory import make_portable
-from store_parts import make_best, make_checkpoint
-from sweep_folders import make_sweep_folder
+from store_parts import make_best
+from sweep_folders import chosen, extend_by_leaders, make_sweep_folder
 
 from policies.portable.file import read_policy
 from tune_jobs.service import derived
@@ -32,7 +32,7 @@ FILM = bytes(range(256)) * 4_000
 def make_finished(folder: Path, **spec: Any) -> SweepStore:
     """A sweep that has ended, with a winner, films and a report."""
     made = make_sweep_folder(folder, **spec)
-    made.write_best(make_best(checkpoint=make_checkpoint(6, trial_id="t0003")), make_portable("CartPole-v1"))
+    made.write_best(make_best(**chosen(made)), make_portable("CartPole-v1"))
     with made.writing_films() as films:
         for path in films.values():
             path.write_bytes(FILM)
@@ -98,6 +98,21 @@ def test_a_sweep_that_has_made_nothing_says_so(live: Live) -> None:
         assert get(live, path).json()["hint"] == "It is chosen when the sweep has ended."
     for path in ("/report/", "/films/after_mp4", "/policy", "/policy/policy.json", "/best"):
         problem(get(live, path), 404)
+
+
+def test_a_policy_that_was_chosen_before_its_sweep_was_extended_is_not_its_best(live: Live, store: SweepStore) -> None:
+    assert get(live, "/best").json()["checkpoint"]["trial_id"] == "t0003"
+    extend_by_leaders(store)
+    for path in ("/best", "/policy", "/policy/policy.json"):
+        assert "chosen before the sweep was trained on" in problem(get(live, path), 404)
+        assert get(live, path).json()["hint"] == "Resume it: then one is chosen anew."
+    assert {item["path"].split("/")[0] for item in get(live, "/files").json()} == {"report"}
+    # While it runs, and where it was interrupted, the page tells it as an earlier one.
+    with store.lock():
+        assert get(live, "/best").json()["checkpoint"]["trial_id"] == "t0003"
+        assert get(live, "/policy").status_code == 200
+    store.write_record(store.read_record().model_copy(update={"state": "interrupted"}))
+    assert get(live, "/best").json()["checkpoint"]["trial_id"] == "t0003"
 
 
 def test_downloads_are_described(site: Live) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 from live_service import Live, live  # noqa: F401 (a fixture)
-from store_parts import make_best, make_checkpoint
-from sweep_folders import make_sweep_folder
+from store_parts import make_best
+from sweep_folders import chosen, make_sweep_folder
 
 from policies.errors import SpecError
 from tune_jobs.client.client import Client
@@ -20,7 +20,7 @@ from tune_jobs.store.sweep_store import SweepStore
 def odd(live: Live) -> SweepStore:
     """A sweep whose best has an endless score, and two trials of which one has none that is a number."""
     store = make_sweep_folder(live.storage / "odd")
-    store.write_best(make_best(checkpoint=make_checkpoint(6, trial_id="t0003"), selection_score=math.inf))
+    store.write_best(make_best(**chosen(store), selection_score=math.inf))
     for trial_id, value in {"t0001": math.nan, "t0002": -math.inf}.items():
         trial = store.trial(trial_id)
         trial.write_record(trial.read_record().model_copy(update={"evaluation_return": value, "time_s": value}))

@@ -172,12 +172,12 @@ def _line(seen: Summary, elapsed_s: float) -> str:
 def _result(client: Client, job: Job) -> dict[str, Any]:
     """Return what a launch on this machine returns, its paths as addresses."""
     name, is_whole = job.sweep, job.outcome == "completed"
-    best, trials = None, client.records(name)
+    best, trials, why = None, client.records(name), ""
     if is_whole:
         try:
             best = client.best(name)
-        except NotFoundError:
-            best = None
+        except NotFoundError as error:
+            why = str(error)
     files = {file.path for file in client.files(name)} if is_whole else set()
     at = f"{client.url}/api/v1/sweeps/{quote(name)}"
     has_failed = any(trial.status == "failed" for trial in trials)
@@ -186,7 +186,7 @@ def _result(client: Client, job: Job) -> dict[str, Any]:
         "sweep": client.status(name).sweep,
         "trials": trials,
         "best": best,
-        "why_no_best": (job.message or "the service does not say why") if is_whole and best is None else None,
+        "why_no_best": (job.message or why) if is_whole and best is None else None,
         "artifacts": {
             what: f"{at}/{path}" for what, path in _ARTIFACTS.items() if any(file.startswith(path) for file in files)
         },

@@ -16,6 +16,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import name_for_commands
+from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
@@ -181,22 +182,26 @@ def _read(store: Sweep, trial_ids: Iterable[str]) -> list[TrialRecord]:
 
 def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
     is_whole = record.state == "completed" and (job is None or job.driver_exit_code != 130)
-    best = store.read_best() if is_whole and store.has_best() else None
+    trials = readable_trials(store)
+    best = store.read_best() if is_whole and has_current_best(store, trials) else None
     artifacts: dict[str, Path] = {}
     if best is not None:
         artifacts = {"policy": store.best_policy_path, **store.films()}
     page = store.current_report() if is_whole else None
     if page is not None:
         artifacts["report"] = page
+    failed = is_whole and job is not None and job.driver_exit_code == 3
     named = shlex.quote(name_for_commands(store))
-    why = f"none was chosen. `tune-jobs best {named}` does it, or says why not"
+    what = "the one there is was chosen before the sweep was trained on" if store.has_best() else "none was chosen"
+    why = f"{what}. `tune-jobs best {named}` does it, or says why not"
     return SweepResult(
         store.place,
         record,
-        readable_trials(store),
+        trials,
         best=best,
         why_no_best=why if is_whole and best is None else None,
         artifacts=artifacts,
         interrupted=not is_whole,
-        finish_failed=is_whole and job is not None and job.driver_exit_code == 3,
+        # Who leaves out what follows the trials has no report of them either.
+        finish_failed=failed or (is_whole and best is None and page is not None),
     )

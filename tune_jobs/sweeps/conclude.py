@@ -30,6 +30,7 @@ from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
 from tune_jobs.store.opening import name_for_commands
+from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.drawing import ReportMatter, videos_of
 from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
 from tune_jobs.sweeps.settings import judged
@@ -126,8 +127,9 @@ def find_policy(
     """Find a policy by any kind of source.
 
     Args:
-        source: A sweep (its best; chosen now if it has not been), `SWEEP/TRIAL` (its best checkpoint), a checkpoint
-            folder, a policy file, or a baseline: `random` or `constant`.
+        source: A sweep (its best; chosen now if it has not been, or was before the sweep was trained on),
+            `SWEEP/TRIAL` (its best checkpoint), a checkpoint folder, a policy file, or a baseline: `random` or
+            `constant`.
         storage: The folder in which sweeps are looked up by name.
         env_id: The environment it acts in; None: the one it was trained in. A baseline needs one.
         action: The action of `constant`; None: 0.
@@ -154,7 +156,7 @@ def find_policy(
         store, trial_id = _sweep_and_trial(text, storage)
         timeout_s = stored_spec(store.read_record()).iteration_timeout_s
         if trial_id is None:
-            if not store.has_best():
+            if not has_current_best(store):
                 choose_best(store)
             policy = load_policy(store.best_folder)
         else:
@@ -259,7 +261,7 @@ def find_checkpoint(source: str | Path, storage: str | Path | None = None) -> Pa
         store, trial_id = _sweep_and_trial(str(source), storage)
         if trial_id is not None:
             record = best_checkpoint(store, trial_id)
-        elif store.has_best():
+        elif has_current_best(store):
             record = store.read_best().checkpoint
         else:
             record = choose_best(store).checkpoint

@@ -19,7 +19,9 @@ from analysis.wording import PLAIN_NONE, counted, interval_text, return_text
 from policies import random_streams
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.spec.differences import Difference, differences
+from tune_jobs.store.candidates import readable_trials
 from tune_jobs.sweeps.compare import wanted_sweep
+from tune_jobs.sweeps.current_best import has_best_to_show
 from tune_jobs.sweeps.status import status_of
 
 if TYPE_CHECKING:
@@ -144,6 +146,8 @@ def _own_facts(stores: Sequence[Sweep]) -> list[Fact]:
 
 def _policy_text(store: Sweep) -> str:
     """Return the return of the policy to deploy on fresh episodes, with its interval over these."""
+    if not has_best_to_show(store, store.read_record(), readable_trials(store)):
+        return PLAIN_NONE
     try:
         best: BestRecord = store.read_best()
     except NotFoundError:

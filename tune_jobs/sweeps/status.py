@@ -234,7 +234,7 @@ def status_of(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) 
         max_env_steps=None if so_far is None else so_far.max_env_steps,
         env_steps_per_s=None if so_far is None else so_far.env_steps_per_s,
         time_left_s=None if so_far is None else so_far.time_left_s,
-        best=_confirmed(store, record) or _best(trials),
+        best=_confirmed(store, record, trials) or _best(trials),
     )
 
 
@@ -246,12 +246,16 @@ def _forecast(record: SweepRecord, trials: Sequence[TrialRecord], *, alive: bool
         return None
 
 
-def _confirmed(store: Sweep, record: SweepRecord) -> BestSoFar | None:
+def _confirmed(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> BestSoFar | None:
     """Return the winner of a finished sweep, which its evaluations alone do not show."""
+    from tune_jobs.sweeps.current_best import is_outdated
+
     if record.state != "completed" or not store.has_best():
         return None
     try:
         best = store.read_best()
+        if is_outdated(store, best, trials):
+            return None
     except TuneJobsError:
         return None
     at = best.checkpoint

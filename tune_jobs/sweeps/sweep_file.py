@@ -23,6 +23,7 @@ from policies.errors import NotFoundError, SpecError
 from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import is_url
+from tune_jobs.sweeps.current_best import has_best_to_show
 from tune_jobs.sweeps.curves import Columns, Curve
 from tune_jobs.sweeps.gathered import spec_of, sweep_data
 from tune_jobs.sweeps.plain import to_json
@@ -79,7 +80,7 @@ def _document(store: Sweep) -> dict[str, Any]:
         "curves": _curves(data.results),
         "importance": to_json(mattered),
         "front": to_json(front_view(data, spec_of(store).objective.cost)),
-        "best": to_json(_best(store)),
+        "best": to_json(_best(store, record, trials)),
     }
 
 
@@ -124,9 +125,9 @@ def _curves(results: Mapping[str, Sequence[IterationRecord]]) -> dict[str, Colum
     return found
 
 
-def _best(store: Sweep) -> BestRecord | None:
+def _best(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> BestRecord | None:
     try:
-        return store.read_best()
+        return store.read_best() if has_best_to_show(store, record, trials) else None
     except NotFoundError:
-        # None was chosen yet, or it can't be read.
+        # It can't be read.
         return None
