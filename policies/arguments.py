@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from policies.errors import SpecError, shortened
+from policies.suggestions import did_you_mean
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -56,7 +57,14 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        bound = signature.bind(*args, **kwargs)
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            # Python's own message would name the function; that of `bind` does not.
+            unknown = [name for name in kwargs if name not in signature.parameters]
+            nearest = did_you_mean(unknown[0], signature.parameters) if unknown else ""
+            takes = f"it takes {', '.join(signature.parameters)}"
+            raise TypeError(f"{function.__name__}() {error}: {takes}.{nearest}") from None
         for name, value in bound.arguments.items():
             fitted = _fit(value, kinds()[name])
             if fitted is _WRONG:

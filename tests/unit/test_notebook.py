@@ -1,6 +1,7 @@
 """What results look like in a notebook: escaped, bounded, and one output that lives."""
 
 import logging
+import re
 import sys
 import types
 from collections.abc import Iterator
@@ -126,6 +127,11 @@ def test_a_result_tells_what_a_person_asks_first() -> None:
         assert part in text
     assert repr(result).startswith("SweepResult(place='sweeps/mine', state='completed', ")
     assert "best='t0001 scored 200.0'" in repr(result)
+    # What it shows can be asked for by the same name.
+    shown = re.findall(r"[(\s](\w+)=", repr(result))
+    assert {"state", "counts", "artifacts", "exit_code"} <= set(shown)
+    assert all(hasattr(result, name) for name in shown)
+    assert result.counts == {"failed": 1, "completed": 1}
 
 
 def test_a_status_tells_progress_and_time_left() -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from analysis.best_records import BestRecord
 from analysis.notebook import brief_repr, facts_html
-from analysis.records import SweepRecord, TrialRecord
+from analysis.records import SweepRecord, SweepState, TrialRecord, TrialStatus
 from analysis.wording import counted
 from tune_jobs.sweeps.storage import folder_at, shown_place
 
@@ -45,6 +45,16 @@ class SweepResult:
         return folder_at(self.place)
 
     @property
+    def state(self) -> SweepState:
+        """The sweep's state, as `SweepStatus.state` has it."""
+        return self.sweep.state
+
+    @property
+    def counts(self) -> dict[TrialStatus, int]:
+        """The number of trials of each status, without those of which there is none."""
+        return dict(Counter(trial.status for trial in self.trials))
+
+    @property
     def exit_code(self) -> int:
         """130 if it was interrupted, 3 if a trial or what comes after the trials failed, else 0."""
         if self.interrupted:
@@ -52,16 +62,14 @@ class SweepResult:
         return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
 
     def __repr__(self) -> str:
-        counts = dict(Counter(trial.status for trial in self.trials))
         best = self.best and f"{self.best.checkpoint.trial_id} scored {self.best.selection_score:.1f}"
         return brief_repr(
-            "SweepResult", place=self.place, state=self.sweep.state, trials=counts, best=best,
+            "SweepResult", place=self.place, state=self.state, counts=self.counts, best=best,
             why_no_best=self.why_no_best, artifacts=list(self.artifacts), exit_code=self.exit_code,
         )  # fmt: skip
 
     def _repr_html_(self) -> str:
-        counts = Counter(trial.status for trial in self.trials)
-        told = ", ".join(f"{number} {status}" for status, number in counts.items())
+        told = ", ".join(f"{number} {status}" for status, number in self.counts.items())
         steps = sum(trial.num_env_steps for trial in self.trials)
         facts: dict[str, str | Path] = {
             "trials": f"{counted(len(self.trials), 'trial')}: {told or 'none'}; {counted(steps, 'env step')}"
