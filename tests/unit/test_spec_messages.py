@@ -144,6 +144,24 @@ def test_what_is_said_of_common_mistakes(fields: dict[str, Any], message: str) -
     assert f"sweep: {message}" in present(problem_with({**MINIMAL, **fields}))
 
 
+@pytest.mark.parametrize(
+    ("kind", "ends", "wanted"),
+    [
+        ("uniform", [1, 64], "randint"),
+        ("loguniform", [1, 64], "lograndint, qlograndint or power_of_two"),
+        ("quniform", [1, 64, 0.5], "qrandint"),
+        ("qloguniform", [1, 64, 0.5], "qlograndint"),
+    ],
+)
+def test_a_range_that_gives_fractions_is_answered_with_its_counterpart_of_whole_numbers(
+    kind: str, ends: list[float], wanted: str
+) -> None:
+    for name in ("num_epochs", "stop.num_env_steps"):
+        message = present(problem_with({**MINIMAL, "space": {name: {kind: ends}}}))
+        assert f"but {name} must be a whole number: use {wanted} in place of {kind}" in message
+        assert "log form" not in message
+
+
 def test_a_search_that_is_no_is_told_where_it_stands(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r"sweep.yaml, line 3, column 9: no may mean false or a text"):
         load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nsearch: no\n"))

@@ -75,7 +75,7 @@ def wrong(domain: Any, **fields: Any) -> str:
         ({"choice": [2.5, 5]}, {}, f"space.{TRAINING_LENGTH}.choice[0]: 2.5 is not allowed: it should be a whole"),
         ({"choice": ["5", 5]}, {}, "'5' is not a number"),
         ({"choice": [True, 5]}, {}, "true is not a number"),
-        ({"loguniform": [10, 99]}, {}, "stop.num_env_steps must be a whole number: use randint"),
+        ({"loguniform": [10, 99]}, {}, "stop.num_env_steps must be a whole number: use lograndint"),
         ({"randint": [-5, 99]}, {}, "-5 is not allowed: it should be at least 1"),
         ({"choice": []}, {}, "is empty: list at least one value"),
         ({"choice": [5_000, 5e3]}, {}, "lists 5000 twice"),

@@ -30,6 +30,13 @@ _LENGTHS = dict.fromkeys(
     f"To search how long a training is, write space: {{{TRAINING_LENGTH}: ...}}; to fix it, stop.num_env_steps.",
 )
 """What to write for names by which the length of training may be called."""
+_OF_WHOLE_NUMBERS = {
+    "uniform": "randint",
+    "loguniform": "lograndint, qlograndint or power_of_two",
+    "quniform": "qrandint",
+    "qloguniform": "qlograndint",
+}
+"""The counterparts of domains that give fractions."""
 
 
 def hyperparam_problems(
@@ -125,8 +132,8 @@ def _domain_problems(algorithm: Algorithm, name: str, domain: Domain) -> list[Pr
         path = f"space.{name}.{domain.kind}"
         found = value_problems(algorithm, name, value, path=path if index is None else f"{path}[{index}]")
         if found and index is None and isinstance(domain, Range):
-            text = f"can give {value!r}, but {name} must be a whole number: use randint, qrandint or a log form"
-            found = [Problem(path, text)]
+            wanted = f"use {_OF_WHOLE_NUMBERS.get(domain.kind, 'randint')} in place of {domain.kind}"
+            found = [Problem(path, f"can give {value!r}, but {name} must be a whole number: {wanted}")]
         if found and isinstance(domain, Layers) and all(problem.path.startswith(f"{path}[") for problem in found):
             # Of each layer the same is told, and a file has no list of them.
             found = [Problem(f"{path}.sizes", found[0].text)]
