@@ -1,12 +1,17 @@
 """What is made of whole sweeps is kept within a number of bytes, and keeps no sweep's trials."""
 
 import gc
+import gzip
+import json
 import weakref
 from pathlib import Path
 
 import pytest
-from sweep_folders import make_sweep_folder
+from policy_factory import make_portable
+from store_parts import make_best
+from sweep_folders import chosen, make_sweep_folder
 
+from tests.narrowing import present
 from tune_jobs.service import derived as module
 from tune_jobs.service.derived import Derived
 from tune_jobs.service.statuses import Statuses
@@ -69,3 +74,27 @@ def test_trials_of_a_sweep_that_is_gone_are_not_kept(derived: Derived, statuses:
     statuses.forget("a")
     gc.collect()
     assert trials() is None
+
+
+def test_a_winner_that_is_chosen_after_the_sweep_is_over_is_told_soon(tmp_path: Path) -> None:
+    store, storage, now = make_sweep_folder(tmp_path / "mine"), open_storage(tmp_path), [100.0]
+    statuses = Statuses(storage, lambda: now[0])
+    derived = Derived(storage, statuses)
+
+    def told() -> tuple[float, bool]:
+        has_best = json.loads(gzip.decompress(derived.sweep_file("mine")))["best"] is not None
+        return present(statuses.see("mine").status.best).score, has_best
+
+    score, has_best = told()
+    assert not has_best
+    # As `tune-jobs best` does, which changes no record.
+    store.write_best(make_best(selection_score=7.5, **chosen(store)), make_portable("CartPole-v1"))
+    now[0] += 5.0
+    assert told() == (7.5, True) != (score, has_best)
+    seen = statuses.see("mine")
+    now[0] += 5.0
+    # Nothing is made anew where nothing has changed.
+    assert statuses.see("mine").status is seen.status
+    store.write_best(make_best(selection_score=8.5, **chosen(store)))
+    now[0] += 5.0
+    assert told() == (8.5, True)

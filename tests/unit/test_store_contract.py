@@ -367,7 +367,7 @@ def test_new_results_that_contradict_are_weighed_as_all_are(harness: Harness, tr
     assert [record.iteration for record in trial.read_iterations()] == [1, 2, 3, 4]
 
 
-def test_stamps_tell_which_trials_were_written(sweep: Sweep, another: Reopen) -> None:
+def test_stamps_tell_which_trials_were_written_and_whether_the_winner_was(sweep: Sweep, another: Reopen) -> None:
     assert another().trial_stamps() == {}
     for index in (0, 1):
         sweep.trial(f"t{index:04d}").write_record(make_trial(index))
@@ -378,6 +378,12 @@ def test_stamps_tell_which_trials_were_written(sweep: Sweep, another: Reopen) ->
     sweep.trial("t0001").write_record(make_trial(1, status="running"))
     after = another().trial_stamps()
     assert {trial_id for trial_id in after if after[trial_id] != before[trial_id]} == {"t0001"}
+    stamps = [another().best_stamp()]
+    for best in (make_best(), make_best(seed=44)):
+        sweep.write_best(best)
+        stamps.append(another().best_stamp())
+        assert another().best_stamp() == stamps[-1]
+    assert (stamps[0], len(set(stamps))) == ((), 3)
 
 
 def test_a_report_is_known_by_the_names_of_its_files(sweep: Sweep, another: Reopen) -> None:

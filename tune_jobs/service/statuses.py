@@ -22,7 +22,7 @@ from tune_jobs.sweeps.status import SweepStatus, status_of
 
 FRESH_S = 0.4
 """How old what is told of a running sweep may be; of one with thousands of trials it may be older."""
-_OLDEST_LOOK_S, _OLDEST_STATUS_S = 2.0, 5.0
+_OLDEST_LOOK_S, _OLDEST_STATUS_S, _OLDEST_WINNER_S = 2.0, 5.0, 5.0
 _SHARE = 0.02
 """The share of a core that following one sweep takes, unless it would be too old then."""
 
@@ -58,6 +58,8 @@ class Seen:
     trials: Trials
     stamp: tuple[int, ...]
     """Of the sweep's record; another one means another record."""
+    best_stamp: tuple[int, ...]
+    """Of the winner that the status has."""
     looked: Done
     summed_up: Done
     of: Trials
@@ -70,8 +72,12 @@ class Seen:
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing changes unless the record does."""
+        """Whether nothing changes unless the record does, or the winner."""
         return not self.status.alive and self.status.sweep.state != "running"
+
+    def is_due(self, now: float) -> bool:
+        """Whether it is time to look again, though the record is the same."""
+        return now - self.looked.at >= _OLDEST_WINNER_S if self.is_over else self.looked.is_due(now, _OLDEST_LOOK_S)
 
 
 class Statuses:
@@ -112,9 +118,14 @@ class Statuses:
         with lock:
             stamp, known = sweep.record_stamp(), self._seen.get(name)
             if known is not None and known.stamp == stamp and known.status.alive == sweep.is_driven():
-                if known.is_over or not known.looked.is_due(self._clock(), _OLDEST_LOOK_S):
+                now = self._clock()
+                if not known.is_due(now):
                     return known
-                is_same = True
+                # `tune-jobs best` chooses anew for a sweep that is over, and changes no record.
+                is_same = not known.is_over or known.best_stamp == sweep.best_stamp()
+                if known.is_over and is_same:
+                    known = self._seen[name] = replace(known, looked=Done(now, 0.0))
+                    return known
             else:
                 # It began or ended, or nobody has asked for it yet: the status has to be of now.
                 is_same = False
@@ -138,8 +149,10 @@ class Statuses:
         looked = Done(now, 0.0 if known is None else now - began)
         if known is not None and is_same and (known.of is trials or not known.summed_up.is_due(now, _OLDEST_STATUS_S)):
             return replace(known, trials=trials, looked=looked)
+        # Before the winner is read: a later one has another stamp.
+        best_stamp = sweep.best_stamp()
         status = status_of(sweep, record, trials.records)
-        return Seen(status, trials, stamp, looked, Done(self._clock(), self._clock() - now), of=trials)
+        return Seen(status, trials, stamp, best_stamp, looked, Done(self._clock(), self._clock() - now), of=trials)
 
     def all(self) -> list[Seen]:
         """Return all sweeps, by name; those that can't be read give a warning.

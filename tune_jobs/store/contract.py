@@ -259,6 +259,10 @@ class Sweep(Protocol):
         """Whether a winner has been written."""
         ...
 
+    def best_stamp(self) -> tuple[int, ...]:
+        """Return what changes whenever a winner is written, without reading it; empty: none has been."""
+        ...
+
     def read_best(self) -> BestRecord:
         """Read the winner's record.
 

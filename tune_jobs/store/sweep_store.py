@@ -234,6 +234,10 @@ class SweepStore:
         """Whether a best policy has been chosen."""
         return (self.best_folder / names.BEST_RECORD).is_file()
 
+    def best_stamp(self) -> tuple[int, ...]:
+        """Return the inode, the size and the time of the winner's record."""
+        return stamp_of(self.best_folder / names.BEST_RECORD)
+
     def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
         """Replace the winner's record and its policy; the policy is written first.
 
@@ -379,7 +383,8 @@ class SweepStore:
 def name_taken(folder: Path) -> SpecError:
     """Return the error for a new sweep whose folder exists already."""
     go_on = f"continue it: `tune-jobs resume {folder.name}`"
-    other = go_on if SweepStore(folder).exists() else f"remove that folder: it has no {names.SWEEP_RECORD}"
+    unfinished = f"unless it is being written just now, remove that folder: it has no {names.SWEEP_RECORD}"
+    other = go_on if SweepStore(folder).exists() else unfinished
     hint = f"Choose another name with --name, or {other}."
     return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 

@@ -141,6 +141,10 @@ class ObjectSweep(Artifacts):
         """Return what changes whenever the record is written; empty: there is no record."""
         return _stamp(self._bucket.look(names.SWEEP_RECORD))
 
+    def best_stamp(self) -> tuple[int, ...]:
+        """Return what changes whenever a winner is written; empty: none has been."""
+        return _stamp(self._bucket.look(f"{names.BEST_FOLDER}/{names.BEST_RECORD}"))
+
     def write_record(self, record: SweepRecord) -> None:
         """Replace the record; all records of trials that were written before are in the store then."""
         self.settle()
