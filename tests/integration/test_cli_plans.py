@@ -57,6 +57,10 @@ def test_one_of_a_thing_is_not_called_many(run: RunCommand) -> None:
 def test_the_env_steps_and_the_disk_of_a_plan_are_those_of_more_seeds_too(run: RunCommand) -> None:
     with_more = run("launch", "cartpole-ppo", "--dry-run").stdout.splitlines()
     without = run("launch", "cartpole-ppo", "--dry-run", "--set", "confirm=none").stdout.splitlines()
+    unfinished = run("launch", "cartpole-ppo", "--dry-run", "--no-finish").stdout.splitlines()
+    assert [line.split()[1:] for line in unfinished if line.startswith("then ")] == [["nothing", "(--no-finish)"]]
+    steps = [next(line for line in lines if line.startswith("env steps")) for lines in (unfinished, without)]
+    assert steps[0].split() == steps[1].split()
 
     def told(lines: list[str], name: str) -> str:
         return next(line.removeprefix(name).strip() for line in lines if line.startswith(name))

@@ -122,3 +122,19 @@ def test_no_setting_races_with_itself(store: SweepStore, tmp_path: Path) -> None
     same = make_sweep_folder(tmp_path / "same", space={"activation": {"choice": ["relu"]}}, num_samples=2)
     with pytest.raises(SpecError, match="has one setting that was trained"):
         race(same.folder)
+
+
+def test_more_seeds_that_are_left_out_as_nothing_is_to_follow_the_trials_are_told(
+    store: SweepStore, tmp_path: Path
+) -> None:
+    confirm = {"top": 2, "seeds": 1, "max_share": 1.0}
+    folder = make_sweep_folder(tmp_path / "raced", num_samples=4, seeds_per_point=1, confirm=confirm).folder
+    left_out = sweeps.resume(folder, finish=False, progress="none")
+    assert len(left_out.trials) == 4
+    (note,) = left_out.notes
+    assert note.startswith("the 2 leading settings got no more seeds (confirm)")
+    assert f"`tune-jobs resume {folder}` does both" in note
+    assert len(sweeps.resume(folder, progress="none").trials) == 6
+    # It has had them.
+    assert sweeps.resume(folder, finish=False, progress="none").notes == ()
+    assert sweeps.resume(store.folder, finish=False, progress="none").notes == ()

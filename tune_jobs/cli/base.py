@@ -181,7 +181,7 @@ action_option = click.option(
 def run_options(command: _Command) -> _Command:
     """Add the options of the commands that run trials."""
     for option in (
-        click.option("--finish/--no-finish", default=True, help="Afterwards: best, evaluate, video and report."),
+        click.option("--finish/--no-finish", default=True, help="Afterwards: confirm, best, evaluate, video, report."),
         click.option("--progress", type=click.Choice(["auto", "none"]), default="auto", help="Live table or nothing."),
         click.option("--detach", is_flag=True, help="Let the cluster at http://... drive it, and leave it to that."),
         click.option(

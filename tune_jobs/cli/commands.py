@@ -106,7 +106,7 @@ def launch(
                 loaded, plan = planned(spec, overrides, name=name, storage=storage, address=options["address"])
             else:
                 loaded, plan = verbs().planned(spec, overrides, name=name)
-        cli_plan.show_plan(loaded, plan, as_json=as_json)
+        cli_plan.show_plan(loaded, plan, as_json=as_json, finish=options["finish"])
         return
     run_verb(ctx, "launch", spec, overrides=overrides, name=name, storage=storage, as_json=as_json, **options)
 

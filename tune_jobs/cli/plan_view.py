@@ -21,13 +21,20 @@ if TYPE_CHECKING:
 _MAX_TRIALS_SHOWN = 24
 
 
-def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
-    """Print the plan of a sweep."""
+def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool, finish: bool = True) -> None:
+    """Print the plan of a sweep.
+
+    Args:
+        spec: The sweep.
+        plan: Its plan.
+        as_json: Whether to print it as JSON.
+        finish: Whether anything follows the trials.
+    """
     if as_json:
         print_json({"spec": spec.model_dump(mode="json"), "plan": plan.to_json()})
         return
     console = make_console()
-    print_facts(console, _plan_facts(spec, plan))
+    print_facts(console, _plan_facts(spec, plan, finish=finish))
     for note in (*plan.notes, *(plan.packs.notes if plan.packs is not None else ())):
         console.print(f"note: {note}", style="yellow")
     console.print(_plan_table(spec, plan))
@@ -37,10 +44,10 @@ def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool) -> None:
     console.print("Nothing was started: this was a dry run.", style="dim")
 
 
-def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
+def _plan_facts(spec: SweepSpec, plan: SweepPlan, *, finish: bool) -> dict[str, str]:
     from tune_jobs.sweeps.confirm import largest_race
 
-    machine, stop, race = plan.machine, spec.stop, largest_race(spec, plan.num_points)
+    machine, stop, race = plan.machine, spec.stop, largest_race(spec, plan.num_points) if finish else None
     returns = {"training return": stop.training_return, "evaluation return": stop.evaluation_return}
     rules = [f"{name} {value:g}" for name, value in returns.items() if value is not None]
     rules += [] if stop.num_episodes is None else [counted(stop.num_episodes, "episode")]
@@ -61,7 +68,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan) -> dict[str, str]:
         "a trial stops at": " or ".join(rules),
         "search": _search_fact(spec),
         "scheduler": _scheduler_fact(spec),
-        "then": _confirm_fact(race),
+        "then": _confirm_fact(race) if finish else "nothing (--no-finish)",
         "env steps": _env_steps_fact(plan, race),
         "disk": f"at most about {bytes_text(_disk_bytes(plan, race))}",
         "seeds": f"sweep {spec.seed}; evaluation {span(plan.evaluation_seeds)}; "

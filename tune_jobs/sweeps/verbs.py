@@ -132,7 +132,8 @@ def launch(
         name: Name of the sweep and its folder; None: the spec's, else the source's with a number if it is taken.
         storage: Folder for sweeps; None: $TUNE_JOBS_STORAGE, else ./sweeps.
         address: Ray cluster to run on; None: this machine.
-        finish: Whether to choose and confirm the best policy, film it and write the report afterwards.
+        finish: Whether to give the leading settings more seeds (`confirm`), choose and confirm the best policy, film it
+            and write the report afterwards.
         progress: `auto`: a table on a terminal, else lines, also in threads other than the main one; or `none`.
         rl_module: An RLModule class of your own, or its `module:Class`; None: the source's, mostly none.
         wait_for_nodes: The most seconds to wait until the cluster's nodes can hold one trial; its autoscaler is asked
