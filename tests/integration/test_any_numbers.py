@@ -74,7 +74,7 @@ def test_everything_is_shown_and_json_is_json(
     status = SweepStatus(made.sweep, {"completed": 1, "failed": 1}, alive=False)
     result = Result(str(tmp_path), made.sweep, made.trials, made.best, None, {})
     shown: list[Callable[[], None]] = [
-        lambda: show_result(cast("SweepResult", result), storage=None, as_json=as_json),
+        lambda: show_result(cast("SweepResult", result), as_json=as_json),
         lambda: show_sweeps([status], as_json=as_json),
         lambda: show_status(status, as_json=as_json),
         lambda: show_trials(made.trials, as_json=as_json),

@@ -123,9 +123,13 @@ def test_a_launch_tells_the_winner_the_failures_and_where_all_lies(
         assert part in output
 
 
-def test_an_interrupted_launch_says_how_to_resume_on_its_last_line(run: RunCommand, sweeps: FakeSweeps) -> None:
+def test_an_interrupted_launch_says_how_to_resume_on_its_last_line(
+    run: RunCommand, sweeps: FakeSweeps, tmp_path: Path
+) -> None:
+    place = str(tmp_path / "my sweeps" / "mine")
     sweeps.answers["launch"] = dataclasses.replace(
         sweeps.answers["launch"],
+        place=place,
         best=None,
         why_no_best="no trial was evaluated",
         interrupted=True,
@@ -134,7 +138,7 @@ def test_an_interrupted_launch_says_how_to_resume_on_its_last_line(run: RunComma
     result = run("launch", "x", "--storage", "my sweeps")
     assert result.exit_code == 130
     assert "no trial was evaluated" in result.stdout
-    assert result.stderr.splitlines()[-1].endswith("tune-jobs resume mine --storage 'my sweeps'")
+    assert result.stderr.splitlines()[-1].endswith(f"tune-jobs resume '{place}'")
 
 
 def test_trials_are_a_table_in_which_no_value_is_cut_or_taken_for_markup(run: RunCommand, sweeps: FakeSweeps) -> None:
@@ -187,8 +191,8 @@ def test_the_status_tells_progress_the_best_and_the_time_left(run: RunCommand, s
     [
         ("running", True, "not known before the trials that are left report env steps"),
         ("completed", True, "the trials are done; the best is being confirmed and filmed, and the report written"),
-        ("interrupted", False, "nothing runs; `tune-jobs resume mine --storage 'my sweeps'` continues it"),
-        ("created", False, "nothing runs; `tune-jobs resume mine --storage 'my sweeps'` starts it"),
+        ("interrupted", False, "nothing runs; `tune-jobs resume '/my sweeps/mine'` continues it"),
+        ("created", False, "nothing runs; `tune-jobs resume '/my sweeps/mine'` starts it"),
         ("completed", False, None),
     ],
 )
@@ -196,8 +200,9 @@ def test_time_left_is_told_in_words_where_there_is_no_number(
     run: RunCommand, sweeps: FakeSweeps, state: str, alive: bool, words: str | None
 ) -> None:
     record = SWEEP.model_copy(update={"state": state})
-    sweeps.answers["status"] = dataclasses.replace(RUNNING, sweep=record, alive=alive, time_left_s=None)
-    assert facts(run("status", "mine", "--storage", "my sweeps").stdout).get("time left") == words
+    changes: dict[str, Any] = {"alive": alive, "time_left_s": None, "place": "/my sweeps/mine"}
+    sweeps.answers["status"] = dataclasses.replace(RUNNING, sweep=record, **changes)
+    assert facts(run("status", "mine", "--storage", "/my sweeps").stdout).get("time left") == words
 
 
 def test_why_the_time_left_is_not_known(run: RunCommand, sweeps: FakeSweeps) -> None:

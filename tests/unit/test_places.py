@@ -1,5 +1,6 @@
 """Places of sweeps and storages: folders, and URLs of object stores."""
 
+import dataclasses
 import shlex
 from pathlib import Path
 
@@ -214,12 +215,15 @@ def test_the_names_in_json_stay() -> None:
 
 def test_a_command_that_is_told_can_be_pasted(capsys: pytest.CaptureFixture[str]) -> None:
     place = f"s3://b/mine{SETTINGS}&region=eu"
-    show_result(SweepResult(place, SWEEP, TRIALS, BEST, interrupted=True), storage="s3://b", as_json=False)
+    show_result(SweepResult(place, SWEEP, TRIALS, BEST, interrupted=True), as_json=False)
     assert f"tune-jobs resume {shlex.quote(place)}\n" in capsys.readouterr().err
-    status = SweepStatus(SWEEP.model_copy(update={"state": "interrupted"}), {}, alive=False)
-    assert f"resume '{place}'` continues it" in status.facts(place=place)["time left"]
-    assert f"resume {SWEEP.name} --storage x` continues" in status.facts(" --storage x")["time left"]
-    show_status(status, sweep=place, as_json=False)
+    status = SweepStatus(SWEEP.model_copy(update={"state": "interrupted"}), {}, alive=False, place=place)
+    assert f"resume '{place}'` continues it" in status.facts()["time left"]
+    at_service = dataclasses.replace(status, place=None)
+    assert (
+        f"`tune-jobs --server x resume {SWEEP.name}` continues" in at_service.facts("tune-jobs --server x")["time left"]
+    )
+    show_status(status, as_json=False)
     assert "resume 's3://b/mine?endpoint" in capsys.readouterr().out
     assert shown_path(place) == place
 

@@ -51,5 +51,5 @@ def show_until_end(sweep: str, *, storage: str | None, progress: str, as_json: b
                 output.print_json({"error": message, "hint": hint, "exit_code": _INTERRUPTED})
         return _INTERRUPTED
     with losing_what_nobody_reads(result.interrupted):
-        output.show_result(result, storage=storage, as_json=as_json)
+        output.show_result(result, as_json=as_json)
     return result.exit_code

@@ -137,7 +137,7 @@ def status(*, sweep: str, storage: str | None, as_json: bool) -> None:
         state = sweeps.status(sweep, storage=storage)
         # Who asks a service may have neither a way to the cluster nor its token, and resumes it there, not by a job.
         job = job_facts(state) if server_of() is None else None
-    cli_output.show_status(state, sweep=sweep, storage=storage, program=program(), job=job, as_json=as_json)
+    cli_output.show_status(state, program=program(), job=job, as_json=as_json)
 
 
 @cli.command()
@@ -218,7 +218,7 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
     sweeps = verbs()
     with stdout_for(as_json=as_json):
         was_running = sweeps.stop(sweep, storage=storage)
-    cli_output.show_stop(sweep, was_running=was_running, program=program(), as_json=as_json)
+    cli_output.show_stop(sweep, was_running=was_running, storage=storage, program=program(), as_json=as_json)
 
 
 @cli.command()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, return_text, setting_text
-from tune_jobs.store.urls import is_url
+from tune_jobs.store.opening import open_sweep, resume_command
 from tune_jobs.sweeps.plain import to_json
 
 if TYPE_CHECKING:
@@ -41,15 +41,8 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=False))
 
 
-def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> None:
+def show_result(result: SweepResult, *, as_json: bool) -> None:
     """Print the result of a launch, resume or extend, and the paths of its files."""
-    # A URL finds the sweep from any folder and machine; a name needs its storage.
-    name, at = (result.place, "") if is_url(result.place) else (result.sweep.name, storage_option_of(storage))
-    if result.sweep.job is not None:
-        at += f" --address {shlex.quote(result.sweep.job.address)} --detach"
-    elif result.sweep.address is not None:
-        at += f" --address {shlex.quote(result.sweep.address)}"
-    how_to_resume = f"tune-jobs resume {shlex.quote(name)}{at}"
     if as_json:
         print_json({**to_json(result), "exit_code": result.exit_code})
     else:
@@ -62,7 +55,7 @@ def show_result(result: SweepResult, *, storage: str | None, as_json: bool) -> N
             notes=result.notes,
         )  # fmt: skip
     if result.interrupted:
-        say_interrupted(result.sweep, how_to_resume)
+        say_interrupted(result.sweep, resume_command(open_sweep(result.place), result.sweep))
 
 
 def print_outcome(
@@ -146,26 +139,14 @@ def local_time(unix_time: float) -> str:
 
 
 def show_status(
-    status: SweepStatus,
-    *,
-    sweep: str | None = None,
-    storage: str | None = None,
-    program: str = "tune-jobs",
-    job: Mapping[str, str] | None = None,
-    as_json: bool,
+    status: SweepStatus, *, program: str = "tune-jobs", job: Mapping[str, str] | None = None, as_json: bool
 ) -> None:
-    """Print how far a sweep is, what is best so far, how long it will take, and the job that drives it, if one does.
-
-    `sweep` is how the sweep was named.
-    """
+    """Print how far a sweep is, what is best so far, how long it will take, and the job that drives it, if one does."""
     if as_json:
         print_json({**to_json(status), **({"job": job} if job else {})})
         return
     told = {"job": f"{job['id']} at {job['address']}: {job['state']}"} if job else {}
-    place = sweep if sweep is not None and is_url(sweep) else None
-    option = "" if place is not None else storage_option_of(storage)
-    option += f" --address {shlex.quote(job['address'])} --detach" if job else ""
-    print_facts(make_console(), status.facts(option, program, place) | told)
+    print_facts(make_console(), status.facts(program) | told)
 
 
 def show_best(best: BestRecord, *, as_json: bool) -> None:
@@ -299,13 +280,16 @@ def show_paths(paths: Mapping[str, Path], *, as_json: bool) -> None:
         print_facts(make_console(), {name: shown_path(path) for name, path in paths.items()})
 
 
-def show_stop(sweep: str, *, was_running: bool, program: str = "tune-jobs", as_json: bool) -> None:
+def show_stop(
+    sweep: str, *, was_running: bool, storage: str | None = None, program: str = "tune-jobs", as_json: bool
+) -> None:
     """Print whether there was something to stop."""
     if as_json:
         print_json({"sweep": sweep, "was_running": was_running})
     elif was_running:
         click.echo(
-            f"{sweep} stops after the iterations now running; `{program} resume {shlex.quote(sweep)}` continues it."
+            f"{sweep} stops after the iterations now running; "
+            f"`{program} resume {shlex.quote(sweep)}{storage_option_of(storage)}` continues it."
         )
     else:
         click.echo(f"{sweep} is not running.")

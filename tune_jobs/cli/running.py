@@ -44,5 +44,5 @@ def run_verb(
     with losing_what_nobody_reads(result.interrupted):
         if verb == "extend" and result.interrupted:
             click.echo("The samples are in the sweep by now: extend again would add as many once more.", err=True)
-        cli_output.show_result(result, storage=storage, as_json=as_json)
+        cli_output.show_result(result, as_json=as_json)
     ctx.exit(result.exit_code)

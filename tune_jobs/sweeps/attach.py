@@ -15,7 +15,7 @@ from tune_jobs.ray_tune.jobs import Job
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands
+from tune_jobs.store.opening import name_for_commands, resume_command
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
@@ -55,17 +55,16 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
             f"Sweep {store.name} was removed while it was shown, or its storage is gone: {store.place} has no record.",
             "List the others: `tune-jobs list`.",
         )
-    record, named = store.read_record(), shlex.quote(name_for_commands(store))
+    record = store.read_record()
+    go_on = resume_command(store, record)
     if record.job is not None and job is not None and job.has_ended and not ran(job):
         raise failure_of(store, record.job, job)
     if record.state == "created":
-        raise CannotRunError(
-            f"Sweep {store.name} has not begun, and nothing runs it.", f"Run it with `tune-jobs resume {named}`."
-        )
+        raise CannotRunError(f"Sweep {store.name} has not begun, and nothing runs it.", f"Run it with `{go_on}`.")
     if record.state == "running":
         raise CannotRunError(
             f"The process that ran sweep {store.name} has ended without finishing it.",
-            f"What is done is kept; continue with `tune-jobs resume {named}`.",
+            f"What is done is kept; continue with `{go_on}`.",
         )
     return _result(store, record, job)
 

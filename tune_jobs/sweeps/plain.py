@@ -21,6 +21,8 @@ def to_json(value: Any) -> Any:
         return to_json(data)
     if is_dataclass(value) and not isinstance(value, type):
         named = {field.metadata.get("json", field.name): getattr(value, field.name) for field in fields(value)}
+        # What has no name there is for this machine alone.
+        named.pop(None, None)
         return to_json(named)
     if isinstance(value, Mapping):
         return {str(key): to_json(item) for key, item in value.items()}

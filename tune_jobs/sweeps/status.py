@@ -6,7 +6,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from policies.arguments import checked
 from policies.errors import CheckpointError, TuneJobsError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import open_storage
+from tune_jobs.store.opening import open_storage, open_sweep, resume_command
 from tune_jobs.sweeps.forecast import Forecast, caps_of, forecast
 from tune_jobs.sweeps.storage import storage_place
 
@@ -57,6 +57,8 @@ class SweepStatus:
     """An estimate of the seconds until all trials have ended; None: not known, or nothing runs."""
     best: BestSoFar | None = None
     """None: no trial has been evaluated yet, or none that was may win."""
+    place: str | None = field(default=None, compare=False, metadata={"json": None})
+    """The folder or URL by which commands find it here; None: they find it by its name, as at a service."""
 
     @property
     def state(self) -> str:
@@ -73,15 +75,12 @@ class SweepStatus:
         """The number of trials by status, as text."""
         return ", ".join(f"{number:,} {name}" for name, number in self.counts.items() if number) or "none"
 
-    def facts(self, option: str = "", program: str = "tune-jobs", place: str | None = None) -> dict[str, str]:
+    def facts(self, program: str = "tune-jobs") -> dict[str, str]:
         """Return what is known, each with its name, for a reader.
 
         Args:
-            option: What a command needs besides the sweep's name to find it.
-            program: How a command begins.
-            place: The sweep's place, if a command has to name it by that; None: its name does.
+            program: How a command begins that finds the sweep by its name.
         """
-        named = f"{shlex.quote(place or self.sweep.name)}{option}"
         facts = {
             "sweep": self.sweep.name,
             "state": self.state,
@@ -90,7 +89,7 @@ class SweepStatus:
             "trials": f"{self.sweep.num_trials:,}: {self.told_counts}",
             "best so far": _best_text(self.best),
             "speed": "" if self.env_steps_per_s is None else f"{self.env_steps_per_s:,.0f} env steps/s",
-            "time left": self._time_left(named, program),
+            "time left": self._time_left(program),
             "run time": self._run_time(),
         }
         return {name: text for name, text in facts.items() if text}
@@ -116,12 +115,12 @@ class SweepStatus:
         share = 100 * self.num_env_steps // self.max_env_steps
         return f"{share} %: {self.num_env_steps:,} of at most {counted(self.max_env_steps, 'env step')}"
 
-    def _time_left(self, named: str, program: str) -> str:
+    def _time_left(self, program: str) -> str:
         if not self.alive:
             if self.sweep.state == "completed":
                 return ""
             verb = "starts" if self.sweep.state == "created" else "continues"
-            return f"nothing runs; `{program} resume {named}` {verb} it"
+            return f"nothing runs; `{self._how_to_resume(program)}` {verb} it"
         if self.sweep.state == "completed":
             return "the trials are done; the best is being confirmed and filmed, and the report written"
         if self.waits_for is not None:
@@ -129,6 +128,11 @@ class SweepStatus:
         if self.time_left_s is None:
             return self._why_unknown()
         return f"about {duration(self.time_left_s, tenths=False, none=PLAIN_NONE)}"
+
+    def _how_to_resume(self, program: str) -> str:
+        if self.place is None:
+            return f"{program} resume {shlex.quote(self.sweep.name)}"
+        return resume_command(open_sweep(self.place), self.sweep)
 
     def _why_unknown(self) -> str:
         """Say why there is no estimate, though the sweep runs."""
@@ -158,7 +162,7 @@ class SweepStatus:
         return f"{duration(before, none=PLAIN_NONE)} before this run"
 
     def __repr__(self) -> str:
-        told = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "sweep"}
+        told = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("sweep", "place")}
         return brief_repr("SweepStatus", name=self.sweep.name, state=self.state, **told)
 
     def _repr_html_(self) -> str:
@@ -214,11 +218,14 @@ def _status(store: Sweep) -> SweepStatus:
     from tune_jobs.store.candidates import readable_trials
 
     record = store.read_record()
-    return status_of(store, record, readable_trials(store))
+    return replace(status_of(store, record, readable_trials(store)), place=store.place)
 
 
 def status_of(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> SweepStatus:
     """Return the status of a sweep whose records have been read."""
+    if record.name != store.name:
+        # Somebody has renamed or copied its folder: by that name it is listed and found.
+        record = record.model_copy(update={"name": store.name})
     alive = store.is_driven()
     counts = Counter(trial.status for trial in trials)
     if record.state == "running" and not alive:

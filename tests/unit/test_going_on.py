@@ -1,0 +1,99 @@
+"""The commands that are told to go on with a sweep do that, wherever it is, and with no other one."""
+
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_sweeps import FakeSweeps, RunCommand, run, sweeps  # noqa: F401 (fixtures)
+from sweep_folders import make_sweep_folder
+
+from analysis.records import JobRecord
+from tune_jobs.cli.output import show_result
+from tune_jobs.store.opening import resume_command
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps import verbs
+from tune_jobs.sweeps.outcome import SweepResult
+
+# ruff: noqa: F811 - fixtures are named as arguments
+
+JOB = JobRecord(id="mine-1", address="http://head:8265")
+RAN = pytest.mark.parametrize(
+    ("ran", "options"),
+    [
+        ({}, ""),
+        ({"address": "ray://head:10001"}, " --address ray://head:10001"),
+        ({"job": JOB}, " --address http://head:8265 --detach"),
+    ],
+)
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SweepStore:
+    """A sweep that was interrupted, in no storage that commands look in."""
+    monkeypatch.setattr("tune_jobs.sweeps.detached.job_now", lambda *_: None)
+    made = make_sweep_folder(tmp_path / "my data" / "mine", iterations=1)
+    made.write_record(made.read_record().model_copy(update={"state": "interrupted"}))
+    return made
+
+
+def change(store: SweepStore, **changes: Any) -> None:
+    store.write_record(store.read_record().model_copy(update=changes))
+
+
+@RAN
+@pytest.mark.parametrize("storage", [None, "my data"])
+def test_a_status_names_the_sweep_by_its_place_and_where_it_ran(
+    run: RunCommand, store: SweepStore, ran: dict[str, Any], options: str, storage: str | None
+) -> None:
+    change(store, **ran)
+    told = run("status", store.folder) if storage is None else run("status", "mine", "--storage", storage)
+    command = f"tune-jobs resume {shlex.quote(store.place)}{options}"
+    assert f"nothing runs; `{command}` continues it" in told.stdout
+    assert command == resume_command(store, store.read_record())
+    # As in a notebook.
+    assert command in verbs.status(store.folder).facts()["time left"]
+
+
+@RAN
+def test_what_was_interrupted_does_so_too(
+    capsys: pytest.CaptureFixture[str], store: SweepStore, ran: dict[str, Any], options: str
+) -> None:
+    change(store, **ran)
+    result = SweepResult(store.place, store.read_record(), store.read_trials(), interrupted=True)
+    show_result(result, as_json=False)
+    told = f"Continue with: tune-jobs resume {shlex.quote(store.place)}{options}"
+    assert capsys.readouterr().err.strip().endswith(told)
+
+
+def test_in_the_default_storage_the_name_is_enough(
+    run: RunCommand, store: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "my data")
+    assert "`tune-jobs resume mine` continues it" in run("status", store.folder).stdout
+
+
+@pytest.mark.parametrize(("state", "words"), [("created", "Run it with"), ("running", "continue with")])
+def test_attach_does_so_too(run: RunCommand, store: SweepStore, state: str, words: str) -> None:
+    change(store, state=state, address="ray://head:10001")
+    told = run("attach", store.folder)
+    assert told.exit_code == 5
+    command = f"tune-jobs resume {shlex.quote(store.place)} --address ray://head:10001"
+    assert f"{words} `{command}`" in told.stderr
+
+
+def test_stop_names_the_storage(run: RunCommand, sweeps: FakeSweeps) -> None:
+    assert "`tune-jobs resume mine --storage 'my data'` continues" in run("stop", "mine", "--storage", "my data").stdout
+    assert "`tune-jobs resume mine` continues" in run("stop", "mine").stdout
+
+
+def test_a_copied_sweep_is_called_after_its_folder(run: RunCommand, store: SweepStore) -> None:
+    copy = shutil.copytree(store.folder, store.folder.parent / "backup")
+    rows = run("list", "--storage", copy.parent).stdout.splitlines()
+    assert [row.split()[0] for row in rows if "interrupted" in row] == ["backup", "mine"]
+    told = run("status", "backup", "--storage", copy.parent).stdout
+    assert told.splitlines()[0].split() == ["sweep", "backup"]
+    assert f"resume {shlex.quote(str(copy))}` continues it" in told
+    assert verbs.status(copy).sweep.name == "backup"
+    assert "place" not in run("status", copy, "--json").stdout
