@@ -237,6 +237,33 @@ def test_wrong_conditions_are_told_with_other_mistakes_and_not_of_domains_that_a
     assert "num_samples" in told
 
 
+@pytest.mark.parametrize("key", ["when", "When", "wehn"])
+def test_a_condition_beside_the_hyperparameters_is_told_its_place_alone(key: str) -> None:
+    told = refused({"replay": REPLAY, "prioritized_alpha": {"uniform": [0.1, 1.0]}, key: {"replay": "prioritized"}})
+    assert f"sweep: space.{key}: dqn has no hyperparameter {key!r}. `when` belongs inside the braces" in told
+    assert "there is no domain" not in told
+    assert "It has activation" not in told
+    several = {key: {"replay": "prioritized", "dueling": True}, "replay": REPLAY}
+    assert "needs exactly one key" not in refused(several)
+
+
+@pytest.mark.parametrize(
+    ("key", "suggestion"), [("When", " Did you mean 'when'?"), ("wehn", " Did you mean 'when'?"), ("q", "")]
+)
+def test_a_second_key_of_a_domain_is_answered_with_when(key: str, suggestion: str) -> None:
+    told = refused({"replay": REPLAY, "prioritized_alpha": {"uniform": [0.1, 1.0], key: {"replay": "prioritized"}}})
+    where = f"space.prioritized_alpha: has {key} beside uniform"
+    assert told.endswith(f"{where}, where only when may stand, its condition.{suggestion}")
+
+
+def test_under_a_name_that_there_is_not_a_misspelt_domain_is_told_too() -> None:
+    told = refused({"gama": {"unifrom": [0.9, 1]}, "stop": {"num_env_steps": {"choice": [1, 2]}}})
+    assert "space.gama: there is no domain 'unifrom'" in told
+    assert "Did you mean 'gamma'?" in told
+    assert "there is no domain 'num_env_steps'" not in told
+    assert "write space: {stop.num_env_steps: ...}" in told
+
+
 def test_grids_may_depend_on_draws_where_they_are_lists_to_choose_from() -> None:
     space = {"replay": REPLAY, "prioritized_alpha": {"grid": [0.1, 0.2], "when": {"replay": "prioritized"}}}
     assert load_spec({**DQN, "space": space, "search": "tpe", "num_samples": 20}).space["prioritized_alpha"].when

@@ -124,7 +124,7 @@ def test_a_cost_is_set_beside_the_name_that_a_file_may_give_the_score() -> None:
     ("overrides", "told"),
     [
         (["space.lr.loguniform=[1e-4, 1e-2]"], "and has uniform and loguniform"),
-        ([f"space.lr.{name}=1" for name in "abcde"], "and has uniform and a and b and c and more"),
+        ([f"space.lr.{name}=1" for name in "abcde"], "has a and b and c and d and more beside uniform"),
         (["space.lr={}"], "and has none"),
     ],
 )

@@ -58,6 +58,10 @@ def _kinds_in(value: Mapping[str, Any]) -> list[str]:
     return [key for key in value if key != "when"]
 
 
+def _listed(keys: list[str]) -> str:
+    return " and ".join(map(str, keys[:_MOST_SHOWN])) + (" and more" if len(keys) > _MOST_SHOWN else "")
+
+
 def _check_shape(value: Any) -> Any:
     """Refuse a value that is not a domain, with a message that shows how to write one."""
     if isinstance(value, AnyDomain):
@@ -71,11 +75,16 @@ def _check_shape(value: Any) -> Any:
             f"{yaml_text(value)} is one value: fix it under hyperparams, or write a domain such as {{grid: [...]}}"
         )
     found = _kinds_in(value)
+    others = [key for key in found if key not in _KINDS]
+    if others and len(found) - len(others) == 1:
+        kind = next(key for key in found if key in _KINDS)
+        suggestion = "" if "when" in value else did_you_mean(others[0], ["when"])
+        raise ValueError(f"has {_listed(others)} beside {kind}, where only when may stand, its condition.{suggestion}")
     if len(found) != 1:
         kinds = ", ".join(DOMAIN_KINDS)
         beside = " beside when" if "when" in value else ""
-        has = " and ".join(map(str, found[:_MOST_SHOWN])) + (" and more" if len(found) > _MOST_SHOWN else "")
-        raise ValueError(f"needs exactly one key{beside}, the kind of the domain ({kinds}), and has {has or 'none'}")
+        has = _listed(found) or "none"
+        raise ValueError(f"needs exactly one key{beside}, the kind of the domain ({kinds}), and has {has}")
     kind = found[0]
     if kind not in _KINDS:
         suggestion = did_you_mean(kind, DOMAIN_KINDS)

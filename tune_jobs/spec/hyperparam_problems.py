@@ -30,6 +30,10 @@ _LENGTHS = dict.fromkeys(
     f"To search how long a training is, write space: {{{TRAINING_LENGTH}: ...}}; to fix it, stop.num_env_steps.",
 )
 """What to write for names by which the length of training may be called."""
+_CONDITION = (
+    "`when` belongs inside the braces of the hyperparameter that it is about, as in "
+    "lr: {loguniform: [1e-4, 1e-2], when: {activation: relu}}."
+)
 _OF_WHOLE_NUMBERS = {
     "uniform": "randint",
     "loguniform": "lograndint, qlograndint or power_of_two",
@@ -114,6 +118,8 @@ def as_taken(algorithm: Algorithm, name: str, value: Any) -> Any:
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     if name in _LENGTHS:
         return f"{algorithm} has no hyperparameter {name!r}. {_LENGTHS[name]}"
+    if did_you_mean(name, ["when"], cutoff=0.75):
+        return f"{algorithm} has no hyperparameter {name!r}. {_CONDITION}"
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
     have = "have" if len(others) > 1 else "has"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Any, get_args
 
@@ -14,7 +14,7 @@ from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from policies.suggestions import did_you_mean
 from policies.wrong_values import Detail, details_of, dotted, explain
 from tune_jobs.spec.condition_problems import condition_problems
-from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.domains import DOMAIN_KINDS, Domain
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.layers import LayersFields
 from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
@@ -24,9 +24,23 @@ from tune_jobs.spec.sections import NAME_RULE, SweepFields
 
 def problems_of(error: ValidationError, data: Any) -> list[Problem]:
     """Return what is wrong with a sweep, from pydantic's error and the data that it was made from."""
-    problems = [_from_detail(detail) for detail in details_of(error)]
     # After a wrong field, pydantic skips the checks of the whole sweep, so the correct fields are checked here.
-    return problems + (_hyperparam_problems(data) if isinstance(data, Mapping) else [])
+    others = _hyperparam_problems(data) if isinstance(data, Mapping) else []
+    told = {problem.path for problem in others}
+    return [_from_detail(detail) for detail in details_of(error) if not _is_told(detail, told)] + others
+
+
+def _is_told(detail: Detail, told: Collection[str]) -> bool:
+    """Whether a detail says that what stands under a name of the space is no domain, which is told of the name.
+
+    Args:
+        detail: What pydantic found.
+        told: The paths of other problems; that of a name in the space is there if there is no such hyperparameter.
+    """
+    location, found = detail["loc"], detail["input"]
+    if len(location) != 2 or dotted(location) not in told or not isinstance(found, Mapping):
+        return False
+    return location[0] == "space" and not any(did_you_mean(key, DOMAIN_KINDS) for key in found)
 
 
 def _hyperparam_problems(data: Mapping[str, Any]) -> list[Problem]:
