@@ -320,13 +320,13 @@ class _Running:
         self.length = 0
         self.total = 0.0
         self.has_terminated = False
-        self._shape = env.observation_space.shape
+        self._space = env.observation_space
         try:
             observation, _ = env.reset(seed=seed)
         except BaseException as error:  # an env may raise anything
             raise self._env_failed("reset", error) from error
         self.observation = self._as_numbers(observation)
-        check_observation(self.observation, self._env_id, 0)
+        check_observation(self.observation, self._env_id, 0, self._space)
 
     def step(self, action: Any) -> bool:
         """Step once and return whether the episode has ended."""
@@ -343,7 +343,7 @@ class _Running:
         self.observation = self._as_numbers(observation)
         if not (math.isfinite(reward) and is_sound(self.observation)):
             check_reward(reward, self._env_id, self.length)
-            check_observation(self.observation, self._env_id, self.length)
+            check_observation(self.observation, self._env_id, self.length, self._space)
         self.has_terminated = bool(terminated)
         return bool(terminated or truncated)
 
@@ -357,14 +357,14 @@ class _Running:
             array = np.asarray(observation)
         except Exception:  # noqa: BLE001 (ragged lists, say)
             array = np.empty(0, dtype=object)
-        if array.dtype.kind in "biuf" and array.shape == self._shape:
+        if array.dtype.kind in "biuf" and array.shape == self._space.shape:
             return array
         method = "step" if self.length else "reset"
         which = f"after env step {self.length}" if self.length else "from reset(), at the beginning"
         what = "None" if observation is None else f"of shape {array.shape} and dtype {array.dtype}"
         raise EnvFailedError(
             f"The observation {which} of the episode of {self._env_id} with seed {self.seed} was {what}, not numbers "
-            f"of shape {self._shape}.",
+            f"of shape {self._space.shape}.",
             f"Mend its {method}(): each observation must be of the observation space.",
         )
 

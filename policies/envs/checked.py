@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.envs.faults import close_env, env_failed
+from policies.envs.flat import FlatBox
+from policies.envs.masks import num_masked, seen_by_networks
 from policies.envs.tallies import only_tally
 from policies.errors import EnvError, EnvFailedError
 
@@ -81,13 +83,14 @@ def check_reward(reward: float, env_id: str, num_steps: int) -> None:
         )
 
 
-def check_observation(observation: Any, env_id: str, num_steps: int) -> None:
+def check_observation(observation: Any, env_id: str, num_steps: int, space: gym.Space[Any] | None = None) -> None:
     """Refuse an observation that is not finite, whatever the bounds of its space.
 
     Args:
         observation: An observation of any shape.
         env_id: The env's id, for the message.
         num_steps: Env steps of the episode so far; 0: the reset returned the observation.
+        space: What it is of, for the message; None: it is what the env itself returned.
 
     Raises:
         EnvFailedError: A number in it is NaN or infinite.
@@ -98,10 +101,18 @@ def check_observation(observation: Any, env_id: str, num_steps: int) -> None:
     place = int(np.flatnonzero(~(np.abs(values) <= _LARGEST_32))[0])
     which = f"after env step {num_steps}" if num_steps else "from reset(), at the beginning"
     raise EnvFailedError(
-        f"The observation {which} of an episode of {env_id} was {_name(float(values.flat[place]))} (number {place} of "
-        f"its {values.size}, counted from 0).",
+        f"The observation {which} of an episode of {env_id} was {_name(float(values.flat[place]))} "
+        f"({_where(values, place, space)}).",
         _HINT,
     )
+
+
+def _where(values: NDArray[Any], place: int, space: gym.Space[Any] | None) -> str:
+    """Return where the env itself has a number of what is observed, which may begin with a mask."""
+    before = 0 if space is None else num_masked(space)
+    if space is not None and isinstance(seen := seen_by_networks(space), FlatBox):
+        return seen.name_of(place - before)
+    return f"number {place - before} of its {values.size - before}, counted from 0"
 
 
 def _name(value: float) -> str:
@@ -196,7 +207,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
     def _check(self, observations: NDArray[Any]) -> None:
         if not is_sound(observations):
             for observation, length in zip(observations, self._lengths.tolist(), strict=True):
-                check_observation(observation, self._env_id, length)
+                check_observation(observation, self._env_id, length, self.env.single_observation_space)
 
     def close(self, **kwargs: Any) -> None:
         """Close all sub-environments; errors of closing are ignored."""

@@ -13,11 +13,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from policies.envs.checked import is_sound, reward_as_number
 from policies.envs.faults import env_failed
 from policies.envs.flat import FlatBox, needs_flattening
-from policies.envs.masks import sample
+from policies.envs.masks import num_masked, sample, seen_by_networks
 from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
@@ -171,9 +172,16 @@ def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
     # Bytes would lose the decimals of a fraction.
     if array.dtype.kind not in ("biuf" if wanted.kind == "f" else "biu"):
         return f"observations of dtype {array.dtype} but declares {wanted}"
-    for place in np.ndindex(array.shape) if not is_sound(array) else ():
+    return None if is_sound(array) else _not_finite(array, space)
+
+
+def _not_finite(array: NDArray[Any], space: gym.Space[Any]) -> str | None:
+    """Say which number is not finite, and where the environment itself has it: behind the mask, if there is one."""
+    seen, array = seen_by_networks(space), array[num_masked(space) :]
+    for number, place in enumerate(np.ndindex(array.shape)):
         if not is_sound(value := np.asarray(array[place])):
-            return f"observations that are not finite: {value} at {list(place)}{_if_finite(value)}"
+            where = seen.name_of(number) if isinstance(seen, FlatBox) else list(place)
+            return f"observations that are not finite: {value} at {where}{_if_finite(value)}"
     return None
 
 

@@ -123,6 +123,14 @@ class FlatBox(gym.spaces.Box):
                 return observations
         return self.flat(observations) if is_one else self._batch(observations)
 
+    def name_of(self, place: int) -> str:
+        """Return how messages name what one of the numbers was made of: `observation['x'][0]`."""
+        part = next(part for part in self._parts if place < part.end)
+        # A number of a Box has a place of its own there; those of a choice are one value.
+        shape = part.space.shape if isinstance(part.space, gym.spaces.Box | gym.spaces.MultiBinary) else ()
+        where = np.unravel_index(place - part.start, shape) if shape else ()
+        return named((*part.keys, *(int(index) for index in where)))
+
     def _batch(self, observations: Any) -> NDArray[Any]:
         return np.stack([self.flat(one) for one in observations])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ from policies.acting.evaluate import evaluate_policy, play_episode
 from policies.acting.policy import RandomPolicy
 from policies.acting.video import record_video
 from policies.envs import calls
-from policies.envs.make import make_env
-from policies.errors import EnvFailedError
+from policies.envs.checked import CheckedEnvs
+from policies.envs.make import check_env, make_env, make_vector_env
+from policies.errors import EnvError, EnvFailedError
+from policies.packed.envs.make import make_packed_envs
 
 ENV = "TestBreaks-v0"
 BROKEN: dict[str, Any] = {
@@ -131,3 +134,77 @@ def test_a_watched_policy_tells_that_it_acts_on_rows(monkeypatch: pytest.MonkeyP
     plain.act_on_rows(rows)
     assert inside[2:] == [(calls.Call.ACT, 5)]
     assert (page.call, page.count) == (calls.Call.NONE, 6)
+
+
+class Ruined(gym.Env[Any, Any]):
+    """A number of what it observes is NaN from some step on; a mask is a member, or an info."""
+
+    action_space = gym.spaces.Discrete(4)
+
+    def __init__(self, kind: str, at: int = 3) -> None:
+        self.kind, self.at, self.steps = kind, at, 0
+        members = {"a": gym.spaces.Discrete(3), "x": gym.spaces.Box(-1, 1, (2, 2), np.float32)}
+        if kind == "member":
+            members["action_mask"] = gym.spaces.MultiBinary(4)
+        self.observation_space: Any = gym.spaces.Dict(members) if kind != "info" else members["x"]
+
+    def _seen(self) -> tuple[Any, dict[str, Any]]:
+        matrix, mask = np.zeros((2, 2), np.float32), np.ones(4, np.int8)
+        if self.steps >= self.at:
+            matrix[1, 0] = np.nan
+        if self.kind == "info":
+            return matrix, {"action_mask": mask}
+        return {"a": 0, "x": matrix} | ({"action_mask": mask} if self.kind == "member" else {}), {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._seen()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        observation, info = self._seen()
+        return observation, 1.0, self.steps == 9, False, info
+
+
+RUINED = "TestRuined-v0"
+
+
+@pytest.mark.parametrize(
+    ("args", "where"),
+    [
+        ({"kind": "plain"}, "observation['x'][1][0]"),
+        ({"kind": "member"}, "observation['x'][1][0]"),
+        ({"kind": "info", "action_mask": True}, "observation[1][0]"),
+        # Of stacked frames only the numbers behind the mask are known.
+        ({"kind": "member", "frame_stack": 2}, "number 12 of its 14, counted from 0"),
+    ],
+    ids=str,
+)
+def test_a_number_that_is_none_is_named_as_the_env_has_it(args: dict[str, Any], where: str) -> None:
+    with registered(RUINED, Ruined):
+        words = re.escape(f"after env step 3 of an episode of {RUINED} was NaN ({where})")
+        random = RandomPolicy.for_env(RUINED, args)
+        with pytest.raises(EnvFailedError, match=words):
+            evaluate_policy(random, env_id=RUINED, env_args=args, seeds=[7])
+        rows = CheckedEnvs(make_vector_env(RUINED, args, 2), RUINED)
+        packed = make_packed_envs(RUINED, args, 1, kind="scalar")
+        packed.add("m", 0)
+        rows.reset(seed=1)
+        for _ in range(2):
+            rows.step(np.zeros(2, np.int64))
+            packed.step(np.zeros(1, np.int64))
+        with pytest.raises(EnvFailedError, match=words):
+            rows.step(np.zeros(2, np.int64))
+        packed.step(np.zeros(1, np.int64))
+        with pytest.raises(EnvError, match=words):
+            raise packed.errors["m"]
+        packed.close()
+
+
+@pytest.mark.parametrize(
+    ("args", "where"), [({"kind": "member"}, "observation['x'][1][0]"), ({"kind": "plain", "frame_stack": 2}, "[5]")]
+)
+def test_so_is_one_of_the_first_observation(args: dict[str, Any], where: str) -> None:
+    with registered(RUINED, Ruined), pytest.raises(EnvError, match=re.escape(f"not finite: nan at {where}")):
+        check_env(RUINED, {**args, "at": 0})

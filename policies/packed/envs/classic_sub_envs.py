@@ -58,7 +58,7 @@ class ClassicSubEnvs:
         errors: dict[str, EnvError] = {}
         if not (is_sound(stepped.rewards) and is_sound(stepped.observations)):
             lengths = rows.lengths.tolist()
-            errors = find_unsound(self._owners, stepped.rewards, stepped.observations, lengths, self._env_id)
+            errors = find_unsound(self._owners, stepped.rewards, stepped.observations, lengths, env_id=self._env_id)
         firsts: dict[int, NDArray[Any]] = {}
         for row in np.flatnonzero(stepped.terminated | stepped.truncated).tolist():
             start = rows.start(self._generators[row])

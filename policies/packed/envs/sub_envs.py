@@ -135,7 +135,7 @@ class SubEnvs:
                 errors[one.member_id] = error
         if not (is_sound(rewards) and is_sound(finals)):
             owners = [one.member_id for one in self._envs]
-            errors = find_unsound(owners, rewards, finals, lengths, self._env_id) | errors
+            errors = find_unsound(owners, rewards, finals, lengths, env_id=self._env_id, space=space) | errors
         return SubStep(finals, firsts, rewards, terminated, truncated, errors)
 
     def close(self) -> None:
@@ -163,7 +163,7 @@ class SubEnvs:
         except BaseException as error:  # an env may raise anything
             raise self._failed("reset", error) from error
         one.num_steps = 0
-        check_observation(first, self._env_id, 0)
+        check_observation(first, self._env_id, 0, one.env.observation_space)
         return first
 
     def _check_shape(self, env: gym.Env[Any, Any], observation: Any) -> None:
@@ -177,7 +177,13 @@ class SubEnvs:
 
 
 def find_unsound(
-    owners: Sequence[str], rewards: NDArray[Any], finals: NDArray[Any], lengths: Sequence[int], env_id: str
+    owners: Sequence[str],
+    rewards: NDArray[Any],
+    finals: NDArray[Any],
+    lengths: Sequence[int],
+    *,
+    env_id: str,
+    space: gym.Space[Any] | None = None,
 ) -> dict[str, EnvError]:
     """Return the errors of members whose rewards or observations are not finite.
 
@@ -187,13 +193,14 @@ def find_unsound(
         finals: What each observed after it.
         lengths: The steps of each one's episode.
         env_id: Gymnasium id, for messages.
+        space: What they observed is of it; None: it is what the env itself returned.
     """
     errors: dict[str, EnvError] = {}
     for place, owner in enumerate(owners):
         if owner not in errors:
             try:
                 check_reward(float(rewards[place]), env_id, lengths[place])
-                check_observation(finals[place], env_id, lengths[place])
+                check_observation(finals[place], env_id, lengths[place], space)
             except EnvError as error:
                 errors[owner] = error
     return errors
