@@ -95,6 +95,21 @@ def test_returns_of_different_envs_share_no_axis(tmp_path: Path) -> None:
         tune_jobs.figure(["one", "other"], storage=tmp_path)
 
 
+def test_sweeps_of_one_name_are_told_by_place_and_share_no_axis_either(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for storage, env in (("a", "CartPole-v1"), ("b", "Acrobot-v1"), ("c", "CartPole-v1")):
+        make_sweep_folder(tmp_path / storage / "mine", env={"id": env})
+    with pytest.raises(SpecError, match="a/mine is on CartPole-v1, b/mine on Acrobot-v1"):
+        tune_jobs.figure(["a/mine", "b/mine"])
+    with pytest.raises(SpecError, match="no common axis"):
+        tune_jobs.export(["a/mine", "b/mine"], format="png")
+    figure = tune_jobs.figure(["a/mine", "c/mine"], top=1)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [label.split(" ")[0] for label in labels[:2]] == ["a/mine", "c/mine"]
+
+
 def test_without_anything_to_draw_it_says_so() -> None:
     data = data_of()
     with pytest.raises(NotFoundError, match="nothing to draw: no setting of mine"):

@@ -200,16 +200,25 @@ def _figure(
     if not names:
         raise SpecError("No sweep was given to draw.", "Give one sweep, or several of one environment.")
     stores = [find_sweep(name, storage) for name in names]
-    envs = {store.name: spec_of(store).env for store in stores}
-    first = stores[0].name
-    for name, env in envs.items():
-        if (env.id, env.args) != (envs[first].id, envs[first].args):
+    labels = _labels(stores)
+    envs = [spec_of(store).env for store in stores]
+    for label, env in zip(labels, envs, strict=True):
+        if (env.id, env.args) != (envs[0].id, envs[0].args):
             raise SpecError(
-                f"Sweep {first} is on {envs[first].id}, {name} on {env.id}"
-                f"{' with other arguments' if env.id == envs[first].id else ''}: their returns have no common axis.",
+                f"Sweep {labels[0]} is on {envs[0].id}, {label} on {env.id}"
+                f"{' with other arguments' if env.id == envs[0].id else ''}: their returns have no common axis.",
                 "Draw them one by one.",
             )
-    return learning_figure([(store.name, sweep_data(store)) for store in stores], top=top, returns=returns, size=size)
+    data = [sweep_data(store) for store in stores]
+    return learning_figure(list(zip(labels, data, strict=True)), top=top, returns=returns, size=size)
+
+
+def _labels(stores: Sequence[Sweep]) -> list[str]:
+    """Return what sweeps are called beside each other: by their names, or by their places where names are the same."""
+    from analysis.wording import shown_path
+
+    names = [store.name for store in stores]
+    return [store.name if names.count(store.name) == 1 else shown_path(store.place) for store in stores]
 
 
 def _write_latex(store: Sweep, path: Path, top: int | None) -> Path:
