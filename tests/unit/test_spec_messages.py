@@ -162,6 +162,60 @@ def test_a_range_that_gives_fractions_is_answered_with_its_counterpart_of_whole_
         assert "log form" not in message
 
 
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        (
+            {"stop.evaluation_return": 100},
+            "no field 'stop.evaluation_return' here: write stop: {evaluation_return: ...}",
+        ),
+        ({"search.num_startup_trials": 3}, "here: write search: {num_startup_trials: ...}"),
+        ({"hyperparams.lr": 1e-3}, "here: write hyperparams: {lr: ...}"),
+        ({"env.args.size": 5}, "here: write env: {args: {size: ...}}"),
+        ({"env.atari.frame_skip": 5}, "here: write env: {atari: {frame_skip: ...}}"),
+        ({"space.stop.num_env_steps": {"grid": [5]}}, "here: write space: {stop.num_env_steps: ...}"),
+        (
+            {"env": {"id": "x", "args.size": 5}},
+            "env.args.size: there is no field 'args.size' here: write args: {size: ",
+        ),
+        (
+            {"stop.evaluation_retrun": 100},
+            "'stop.evaluation_retrun' here, nor 'evaluation_retrun' in stop. Did you mean 'evaluation_return'?",
+        ),
+        ({"search.num_env_steps": 5}, "nor 'num_env_steps' in search. Did you mean stop.num_env_steps?"),
+        ({"stpo.time_s": 5}, "there is no field 'stpo.time_s' here. Did you mean 'stop'?"),
+        ({"seed.time_s": 5}, "there is no field 'seed.time_s' here. Did you mean 'seed'?"),
+    ],
+)
+def test_a_dotted_key_is_written_in_braces_and_nothing_is_guessed_across_the_dot(
+    fields: dict[str, Any], told: str
+) -> None:
+    assert told in present(problem_with({**MINIMAL, **fields}))
+
+
+@pytest.mark.parametrize(
+    ("name", "suggestion"),
+    [
+        ("stop.num_env_step", " Did you mean 'stop.num_env_steps'?"),
+        ("stop.time_s", ""),
+        ("stop.num_episodes", ""),
+        ("stop.evaluation_return", ""),
+    ],
+)
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_of_stop_only_the_length_of_training_is_searched(algorithm: str, name: str, suggestion: str) -> None:
+    message = present(problem_with({**MINIMAL, "algorithm": algorithm, "space": {name: {"grid": [1, 2]}}}))
+    only = f"Of stop, only stop.num_env_steps can be searched, under space; all else is fixed under stop.{suggestion}"
+    assert message == f"sweep: space.{name}: {algorithm} has no hyperparameter {name!r}. {only}"
+
+
+def test_a_dotted_name_of_a_hyperparameter_is_compared_part_by_part() -> None:
+    assert "Did you mean 'lr'?" in present(problem_with({**MINIMAL, "hyperparams": {"ppo.lr": 1e-3}}))
+    message = present(problem_with({**MINIMAL, "space": {"lr.loguniform": {"grid": [1]}, "a.b": {"grid": [1]}}}))
+    assert "'lr.loguniform'. Did you mean 'lr'?" in message
+    assert "'a.b'. It has activation" in message
+
+
 def test_a_search_that_is_no_is_told_where_it_stands(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r"sweep.yaml, line 3, column 9: no may mean false or a text"):
         load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nsearch: no\n"))

@@ -120,14 +120,22 @@ def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
         return f"{algorithm} has no hyperparameter {name!r}. {_LENGTHS[name]}"
     if did_you_mean(name, ["when"], cutoff=0.75):
         return f"{algorithm} has no hyperparameter {name!r}. {_CONDITION}"
+    if name.startswith("stop."):
+        is_field = name.removeprefix("stop.") in StopSpec.model_fields
+        # Nearer than is asked for elsewhere, as all that begins with `stop.` looks alike.
+        suggestion = "" if is_field else did_you_mean(name, [TRAINING_LENGTH], cutoff=0.75)
+        only = (
+            f"Of stop, only {TRAINING_LENGTH} can be searched, under space; all else is fixed under stop.{suggestion}"
+        )
+        return f"{algorithm} has no hyperparameter {name!r}. {only}"
     known = HYPERPARAMS_BY_ALGORITHM[algorithm].model_fields
     others = [other for other, model in HYPERPARAMS_BY_ALGORITHM.items() if name in model.model_fields]
     have = "have" if len(others) > 1 else "has"
     of_others = f" ({' and '.join(others)} {have} it.)" if others else ""
     # By its letters, DQN's learning_starts would be nearer to learning_rate than lr is.
-    suggestion = (
-        answer_to(algorithm, name) or of_others or answer_for_others(algorithm, name) or did_you_mean(name, known)
-    )
+    suggestion = answer_to(algorithm, name) or of_others or answer_for_others(algorithm, name)
+    for part in name.split(".")[::-1]:  # as a whole, `lr.loguniform` is near to nothing, or to something else
+        suggestion = suggestion or did_you_mean(part, known)
     listed = "" if suggestion else f" It has {', '.join(sorted(known))}."
     return f"{algorithm} has no hyperparameter {name!r}.{suggestion}{listed}"
 

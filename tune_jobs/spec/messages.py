@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import NoneType
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
@@ -123,6 +123,8 @@ def _without_tags(location: Iterable[int | str]) -> list[int | str]:
 
 def _unknown_key(location: Sequence[int | str]) -> str:
     name, model = str(location[-1]), _section(location[:-1])
+    if "." in name:
+        return f"there is no field {name!r} here{_of_a_path(name, model)}"
     # A field of exactly this name in another section is more likely meant than a similar one here.
     suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
     listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
@@ -134,11 +136,42 @@ def _section(location: Sequence[int | str]) -> type[BaseModel]:
         return LayersFields  # the only domain with fields
     model: Any = SweepFields
     for part in location:
-        annotation = model.model_fields[str(part)].annotation
-        # One that may be null is a union with None.
-        model = next((one for one in get_args(annotation) if one is not NoneType), annotation)
+        model = _type_of(model, str(part))
     found: type[BaseModel] = model
     return found
+
+
+def _type_of(model: type[BaseModel], name: str) -> Any:
+    """Return the type of a section's field; one that may be null is a union with None."""
+    annotation = model.model_fields[name].annotation
+    if get_origin(annotation) is dict:
+        return dict
+    return next((one for one in get_args(annotation) if one is not NoneType), annotation)
+
+
+def _of_a_path(name: str, model: type[BaseModel]) -> str:
+    """Return what to write for a dotted name, which goes on after `there is no such field here`."""
+    if (written := _in_braces(name, model)) is not None:
+        return f": write {written}"
+    head, _, rest = name.partition(".")
+    inner = _type_of(model, head) if head in model.model_fields else None
+    if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+        return f".{did_you_mean(head, model.model_fields)}"
+    return f", nor {rest!r} in {head}.{_other_place(rest) or did_you_mean(rest, inner.model_fields)}"
+
+
+def _in_braces(name: str, model: type[BaseModel]) -> str | None:
+    """Return a dotted name as a mapping in a section, `stop: {time_s: ...}`; None: there is no such field."""
+    head, dot, rest = name.partition(".")
+    if head not in model.model_fields:
+        return None
+    inner = _type_of(model, head)
+    if not dot:
+        return f"{head}: ..."
+    if inner is dict:  # of names that are a user's own, or may have a dot, such as stop.num_env_steps in the space
+        return f"{head}: {{{rest}: ...}}"
+    written = _in_braces(rest, inner) if isinstance(inner, type) and issubclass(inner, BaseModel) else None
+    return None if written is None else f"{head}: {{{written}}}"
 
 
 def _other_place(name: str) -> str:
