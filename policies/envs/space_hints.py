@@ -48,6 +48,25 @@ def _is_flattenable(space: gym.Space[Any]) -> bool:
         return False
 
 
+def channels_last_hint(env_id: str, space: gym.Space[Any], shape: tuple[int, ...]) -> str:
+    """Suggest what puts the channels of images last.
+
+    Args:
+        env_id: The env's id.
+        space: The space of its images, or of stacks of them.
+        shape: The shape of one image, (channels, rows, columns).
+    """
+    assert isinstance(space, gym.spaces.Box)
+    low, high = (_number(bound) for bound in (space.low.min(), space.high.max()))
+    box = f"gymnasium.spaces.Box({low}, {high}, {(*shape[1:], shape[0])}, numpy.{space.dtype})"
+    move = "lambda image: numpy.moveaxis(image, 0, -1)"
+    return f"{_HOW}: `gymnasium.wrappers.TransformObservation({_make(env_id)}, {move}, {box})` puts the channels last."
+
+
+def _number(value: Any) -> str:
+    return str(value.item()).replace("inf", "numpy.inf")
+
+
 def action_hint() -> str:
     """Suggest what turns actions that no policy gives into such as policies give."""
     return f"{_HOW}, in a gymnasium.ActionWrapper whose actions are all choices, or all numbers."

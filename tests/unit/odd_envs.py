@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -204,6 +205,25 @@ class Images(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         return np.zeros((20, 16, 3), np.uint8), 0.0, True, False, {}
+
+
+class Sized(gym.Env[Any, Any]):
+    """Observes images of any shape, of bytes or of floating-point numbers without bounds."""
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, shape: Sequence[int], floats: bool = False) -> None:
+        low, high = (-np.inf, np.inf) if floats else (0, 255)
+        self.observation_space: Any = gym.spaces.Box(low, high, tuple(shape), np.float32 if floats else np.uint8)
+
+    def seen(self) -> NDArray[Any]:
+        return np.zeros(self.observation_space.shape, self.observation_space.dtype)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.seen(), 0.0, True, False, {}
 
 
 class VerySlow(Fragile):

@@ -1,7 +1,12 @@
 """An environment and the settings that have to go with it: refused when the sweep is planned, with both names."""
 
+import json
+import re
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
+import odd_envs
 import pytest
 
 from policies.envs import modules as env_modules
@@ -14,7 +19,7 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
 
-IMAGES = "odd_envs:Images"
+IMAGES, SIZED = "odd_envs:Images", "odd_envs:Sized"
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +75,50 @@ def test_an_encoder_and_observations_that_do_not_go_together_are_refused_with_bo
 ) -> None:
     with pytest.raises(SpecError, match=words):
         plan(env, **spec)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        *((size, size) for size in (1, 2, 3, 4, 7, 8, 10, 12, 19, 20, 36, 84)),
+        (12, 60),
+        (60, 2, 3),
+        (10, 10, 4),
+        (84, 84, 1),
+    ],
+    ids=str,
+)
+def test_filters_that_are_suggested_are_taken(shape: tuple[int, ...]) -> None:
+    env = {"id": SIZED, "args": {"shape": list(shape)}}
+    with pytest.raises(SpecError, match="conv_filters is null") as caught:
+        plan(env)
+    assert "Channels" not in caught.value.hint
+    assert plan(env, hyperparams={"conv_filters": suggested(caught.value)}).trials
+
+
+def suggested(error: SpecError) -> Any:
+    (found,) = re.findall(r"such as (\[.*\])\.", error.hint)
+    return json.loads(found)
+
+
+@pytest.mark.parametrize("floats", [False, True])
+@pytest.mark.parametrize("filters", [None, [[8, 5, 1]]], ids=str)
+@pytest.mark.parametrize("frame_stack", [1, 4])
+@pytest.mark.parametrize("shape", [(3, 12, 12), (4, 84, 84), (1, 10, 12)], ids=str)
+def test_images_whose_channels_come_first_are_to_be_turned(
+    shape: tuple[int, ...], frame_stack: int, filters: Any, floats: bool
+) -> None:
+    env = {"id": SIZED, "args": {"shape": list(shape), "floats": floats}, "frame_stack": frame_stack}
+    with pytest.raises(SpecError) as caught:
+        plan(env, hyperparams={"conv_filters": filters})
+    assert f"Channels come last here, (rows, columns, channels), but {shape} looks" in caught.value.hint
+    (wrapped,) = re.findall("`(.+?)`", caught.value.hint)
+    wrapped = wrapped.replace("odd_envs.Sized()", f"odd_envs.Sized({shape}, {floats})")
+    turned: Any = eval(wrapped, {"gymnasium": gym, "numpy": np, "odd_envs": odd_envs})
+    assert turned.observation_space.shape == (*shape[1:], shape[0])
+    assert turned.observation_space.contains(turned.reset()[0])
+    if filters is None:
+        assert all(kernel <= min(shape[1:]) for _, kernel, _ in suggested(caught.value))
 
 
 @pytest.mark.parametrize(

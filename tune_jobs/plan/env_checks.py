@@ -15,6 +15,7 @@ from policies.envs.failures import check_failure_penalty
 from policies.envs.make import EnvInfo
 from policies.envs.masks import ACTION_MASK, seen_by_networks
 from policies.envs.own_actions import Choices
+from policies.envs.space_hints import channels_last_hint
 from policies.envs.wrappers import FRAME_STACK, PIXELS
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
@@ -22,9 +23,12 @@ from policies.portable.convolution import output_shape
 from policies.portable.file import action_problem
 from tune_jobs.spec.sweep_spec import SweepSpec
 
-_EXAMPLE = "[[16, 8, 4], [32, 4, 2]]"
+# The fewest rows and columns, and filters that fit them; the second are those of Young and Tian 2019 for MinAtar.
+_EXAMPLES = ((20, "[[16, 8, 4], [32, 4, 2]]"), (3, "[[16, 3, 1]]"), (1, "[[16, 1, 1]]"))
 # Those of Mnih et al. 2015.
-_EXAMPLE_FOR_ATARI = "[[32, 8, 4], [64, 4, 2], [64, 3, 1]]"
+_EXAMPLES_FOR_ATARI = ((36, "[[32, 8, 4], [64, 4, 2], [64, 3, 1]]"), *_EXAMPLES)
+_FEW_CHANNELS = (1, 3, 4)
+"""Of grey images, of coloured ones, and of those with transparency or of four frames."""
 
 
 def check_env_args(spec: SweepSpec) -> None:
@@ -126,8 +130,8 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
                 raise SpecError(
                     f"{env.env_id} has images of shape {shape} as observations, but {place} is null: a network for "
                     "images begins with convolutions.",
-                    f"Set {place} to [channels, kernel, stride] of each layer, such as "
-                    f"{_EXAMPLE if spec.env.atari is None else _EXAMPLE_FOR_ATARI}.",
+                    f"{_channels_hint(spec, env)}Set {place} to [channels, kernel, stride] of each layer, such as "
+                    f"{_example(spec, env)}.",
                 )
             continue
         if not env.observes_images:
@@ -139,4 +143,30 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
         try:
             output_shape(shape, filters)
         except SpecError as error:
-            raise SpecError(f"{place} does not fit {env.env_id}: {error.message}", error.hint) from error
+            hint = f"{_channels_hint(spec, env)}{error.hint}"
+            raise SpecError(f"{place} does not fit {env.env_id}: {error.message}", hint) from error
+
+
+def _example(spec: SweepSpec, env: EnvInfo) -> str:
+    """Return `conv_filters` that fit the images of an environment, if their channels come last."""
+    shape = env.observation_space.shape or ()
+    smallest = min(shape[1:] if _has_channels_first(shape) else shape[:2])
+    examples = _EXAMPLES if spec.env.atari is None else _EXAMPLES_FOR_ATARI
+    return next(example for fewest, example in examples if smallest >= fewest)
+
+
+def _channels_hint(spec: SweepSpec, env: EnvInfo) -> str:
+    """Return what to do about images whose channels seem to come first, as words before another hint; or nothing."""
+    shape = env.observation_space.shape or ()
+    if not _has_channels_first(shape):
+        return ""
+    # Frames are stacked along the last dimension.
+    own_shape = (*shape[:2], shape[2] // spec.env.frame_stack)
+    return (
+        f"Channels come last here, (rows, columns, channels), but {own_shape} looks as if they came first. "
+        f"{channels_last_hint(env.env_id, env.observation_space, own_shape)} "
+    )
+
+
+def _has_channels_first(shape: Sequence[int]) -> bool:
+    return shape[0] in _FEW_CHANNELS and shape[0] < min(shape[1:])
