@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from policies.envs.checked import is_sound, reward_as_number
 from policies.envs.faults import env_failed
 from policies.envs.flat import FlatBox, needs_flattening
-from policies.envs.masks import num_masked, sample, seen_by_networks
+from policies.envs.mask_hints import mask_hint
+from policies.envs.masks import ACTION_MASK, NoMaskError, num_masked, sample, seen_by_networks
 from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
@@ -37,7 +38,7 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
     Args:
         env: The environment.
         env_id: Its id, for messages.
-        env_args: Its arguments, for messages.
+        env_args: The arguments of its constructor, for messages.
 
     Raises:
         EnvFailedError: The env raised an error.
@@ -82,6 +83,11 @@ def _check_call(
         except BaseException as error:  # an env may raise anything
             # The error may be a wrapper's, caused by what the env returned.
             problem = find_problem(inner[-1], env.unwrapped.observation_space) if inner else None
+            if problem is None and isinstance(error, NoMaskError) and method == "reset":
+                raise EnvError(
+                    f"env.{ACTION_MASK} asks for a mask of actions that {env_id} has not: {error}.",
+                    mask_hint(env, error.infos),
+                ) from error
             if problem is None:
                 raise env_failed(complaint, error, f"Check the env's arguments, or mend its {method}().") from error
     if problem is not None:

@@ -40,7 +40,7 @@ from policies.envs.own_actions import (
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
-from policies.envs.wrappers import FailurePenalty, ObservationWrappers, wrapper_of
+from policies.envs.wrappers import FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
 
@@ -142,7 +142,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         )
         _check_action_space(info, algorithm)
         _check_observation_space(info)
-        infos = check_first_step(env, info.env_id, info.env_args)
+        infos = check_first_step(env, info.env_id, constructor_args(info.env_args))
     finally:
         close_env(env)
     if mask is None and wrappers.action_mask is None and _looks_like_mask(infos.get(ACTION_MASK), info.action_space):
@@ -330,7 +330,8 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
     if isinstance(error, EnvError):  # raised by a wrapper, with a message of its own
         return error
     detail = said_by(error) or "no message"
-    arguments = f" with arguments {dict(env_args)!r}" if env_args else ""
+    given = constructor_args(env_args or {})
+    arguments = f" with arguments {given!r}" if given else ""
     message = f"The environment {env_id!r} cannot be made{arguments}: {type(error).__name__}: {detail}."
     if "box2d" in detail.lower():
         # gymnasium[box2d] asks for a source build; this wheel holds the same module.

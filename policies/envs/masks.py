@@ -10,7 +10,6 @@ method, as Stable-Baselines3's contributions have it (`action_masks()`), or in t
 
 from __future__ import annotations
 
-import functools
 import inspect
 import math
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from policies.envs.flat import FlatBox, needs_flattening
+from policies.envs.mask_values import MaskProblemError, checked_mask
 from policies.envs.own_actions import sizes_of
 from policies.errors import EnvError, shortened
 
@@ -144,49 +144,17 @@ class MaskedBox(gym.spaces.Box):
         return f"{self.seen!r} behind a mask of {self.num_masked} actions"
 
 
-class MaskProblemError(ValueError):
-    """A value is no mask; the message fits behind the value."""
-
-
-def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return a mask as a vector of zeros and ones.
+class NoMaskError(ValueError):
+    """The mask that an environment's arguments name is none of its members, methods and infos.
 
     Args:
-        mask: Zeros and ones, or false and true, in any shape; or one such array for each choice.
-        sizes: How many values each choice has.
-
-    Raises:
-        MaskProblemError: It is something else, or a choice has no value that is allowed.
+        message: Says so.
+        infos: The infos that there are.
     """
-    num = sum(sizes)
-    if isinstance(mask, np.ndarray):
-        values = mask.reshape(-1)
-    else:
-        try:
-            parts = mask if isinstance(mask, tuple | list) else [mask]
-            values = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
-        except ValueError:
-            values = np.empty(0, dtype=object)
-    if values.dtype.kind not in "biuf" or values.size != num:
-        raise MaskProblemError(f"not {num} zeros and ones, one for each action")
-    if not ((values == 0) | (values == 1)).all():
-        raise MaskProblemError("not zeros and ones")
-    checked = values.astype(np.float32)
-    if len(sizes) == 1:
-        if not checked.any():
-            raise MaskProblemError("which forbids every action")
-        return checked
-    allowed = np.add.reduceat(checked, _starts(sizes))
-    if not allowed.all():
-        number = int(np.flatnonzero(allowed == 0)[0])
-        raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
-    return checked
 
-
-@functools.cache
-def _starts(sizes: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return where each choice begins in a mask."""
-    return np.cumsum((0, *sizes[:-1]))
+    def __init__(self, message: str, infos: Any) -> None:
+        super().__init__(message)
+        self.infos = infos
 
 
 class MasksActions(gym.Wrapper[Any, Any, Any, Any]):
@@ -210,6 +178,7 @@ class MasksActions(gym.Wrapper[Any, Any, Any, Any]):
         """Reset the environment.
 
         Raises:
+            NoMaskError: There is no info of the mask's name.
             ValueError: Its observation or its mask is none.
         """
         observation, info = self.env.reset(seed=seed, options=options)
@@ -248,9 +217,12 @@ class MasksActions(gym.Wrapper[Any, Any, Any, Any]):
             except (KeyError, TypeError, IndexError):
                 if is_over:
                     return self._everything
-                known = sorted(map(str, holder)) if isinstance(holder, dict) else shortened(holder)
-                else_ = "" if self.source == "observation" else ", nor such a member of the observations, nor a method"
-                raise ValueError(f"there is no {self.place} {when}{else_}; there is {known}") from None
+                known = sorted(map(str, holder)) if isinstance(holder, Mapping) else shortened(holder)
+                problem = f"there is no {self.place} {when}"
+                if self.source == "observation":
+                    raise ValueError(f"{problem}; there is {known}") from None
+                problem += ", nor such a member of the observations, nor a method"
+                raise NoMaskError(f"{problem}; there is {known or 'nothing'}", holder) from None
         try:
             return checked_mask(value, self.space.sizes)
         except MaskProblemError as error:
@@ -321,7 +293,7 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
     observed = env.observation_space
     if source == "observation":
         assert isinstance(observed, gym.spaces.Dict)
-        if problem := _member_problem(observed, name, sizes):
+        if problem := member_problem(observed, name, sizes):
             raise EnvError(f"{env_id} observes a mask of actions, {name!r}, {problem}.", hint)
     try:
         space = MaskedBox.of(observed, sizes, name if source == "observation" else None)
@@ -362,12 +334,12 @@ def _find(env: gym.Env[Any, Any], setting: Setting) -> tuple[Source, str] | None
     name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
     if name in members:
         return "observation", name
-    if env.has_wrapper_attr(method) and _needs_nothing(env.get_wrapper_attr(method)):
+    if env.has_wrapper_attr(method) and needs_nothing(env.get_wrapper_attr(method)):
         return "method", method
     return None if setting is None else ("info", name)
 
 
-def _needs_nothing(method: Any) -> bool:
+def needs_nothing(method: Any) -> bool:
     """Whether something is a method that needs no arguments; Taxi's `action_mask(state)` does."""
     try:
         inspect.signature(method).bind()
@@ -376,7 +348,8 @@ def _needs_nothing(method: Any) -> bool:
     return True
 
 
-def _member_problem(observed: gym.spaces.Dict, name: str, sizes: tuple[int, ...]) -> str:
+def member_problem(observed: gym.spaces.Dict, name: str, sizes: tuple[int, ...]) -> str:
+    """Return why a member of observations is no mask of so many values of choices, by its space; or nothing."""
     if len(observed.spaces) == 1:
         return "and nothing else"
     member = observed[name]

@@ -137,6 +137,11 @@ def with_wrappers(
     return wrapped
 
 
+def constructor_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
+    """Return env arguments without the reserved keys."""
+    return {name: value for name, value in env_args.items() if name not in (FRAME_STACK, PIXELS, ACTION_MASK, ATARI)}
+
+
 def shrink_to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return a small grey picture of a large coloured one, made of the mean brightness of square blocks.
 

@@ -21,7 +21,8 @@ from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo, check_env, make_env, make_vector_env
-from policies.envs.masks import FORBIDDEN, MaskedBox, MaskProblemError, checked_mask
+from policies.envs.mask_values import MaskProblemError, checked_mask
+from policies.envs.masks import FORBIDDEN, MaskedBox
 from policies.envs.spaces import describe_space, space_from_description
 from policies.errors import CheckpointError, EnvError, ObservationError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams

@@ -1,0 +1,58 @@
+"""Suggest what an environment's mask of actions is called, where it is not found by the name that was given."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from policies.envs.mask_values import checked_mask
+from policies.envs.masks import ACTION_MASK, member_problem, needs_nothing
+from policies.envs.own_actions import sizes_of
+
+_LIKE_MASKS = re.compile("mask|legal|valid|allowed")
+
+
+def mask_hint(env: gym.Env[Any, Any], infos: Any) -> str:
+    """Suggest the setting for an environment that has no mask of the name that is set.
+
+    Args:
+        env: The environment, with its wrappers.
+        infos: The infos of its reset.
+    """
+    names = [*_infos(env, infos), *_members(env), *_methods(env)]
+    if not names:
+        return f"Set env.{ACTION_MASK}: false, or leave it out: nothing of the env looks like a mask."
+    return f"Write env.{ACTION_MASK}: {' or '.join(dict.fromkeys(names))}; or false, if that is no mask."
+
+
+def _infos(env: gym.Env[Any, Any], infos: Any) -> Iterator[str]:
+    for name, value in infos.items() if isinstance(infos, Mapping) else ():
+        # What an info holds may be anything, and fail in any way.
+        with contextlib.suppress(Exception):
+            checked_mask(value, sizes_of(env.action_space))
+            yield str(name)
+
+
+def _members(env: gym.Env[Any, Any]) -> Iterator[str]:
+    observed = env.unwrapped.observation_space
+    if not isinstance(observed, gym.spaces.Dict):
+        return
+    for name, member in observed.spaces.items():
+        is_binary = not isinstance(member, gym.spaces.Box) or bool((member.low >= 0).all() and (member.high <= 1).all())
+        if is_binary and not member_problem(observed, name, sizes_of(env.action_space)):
+            yield name
+
+
+def _methods(env: gym.Env[Any, Any]) -> Iterator[str]:
+    """Yield methods by their names alone: to call them might change the environment."""
+    inner = env.unwrapped
+    for name in dir(inner):
+        if _LIKE_MASKS.search(name) and not name.startswith("_"):
+            # A property is computed, and may fail in any way.
+            with contextlib.suppress(Exception):
+                if needs_nothing(getattr(inner, name)):
+                    yield name

@@ -1,0 +1,54 @@
+"""What a mask of actions is: zeros and ones, one for each value of each choice, with something allowed of each."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class MaskProblemError(ValueError):
+    """A value is no mask; the message fits behind the value."""
+
+
+def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return a mask as a vector of zeros and ones.
+
+    Args:
+        mask: Zeros and ones, or false and true, in any shape; or one such array for each choice.
+        sizes: How many values each choice has.
+
+    Raises:
+        MaskProblemError: It is something else, or a choice has no value that is allowed.
+    """
+    num = sum(sizes)
+    if isinstance(mask, np.ndarray):
+        values = mask.reshape(-1)
+    else:
+        try:
+            parts = mask if isinstance(mask, tuple | list) else [mask]
+            values = np.concatenate([np.asarray(part).reshape(-1) for part in parts])
+        except ValueError:
+            values = np.empty(0, dtype=object)
+    if values.dtype.kind not in "biuf" or values.size != num:
+        raise MaskProblemError(f"not {num} zeros and ones, one for each action")
+    if not ((values == 0) | (values == 1)).all():
+        raise MaskProblemError("not zeros and ones")
+    checked = values.astype(np.float32)
+    if len(sizes) == 1:
+        if not checked.any():
+            raise MaskProblemError("which forbids every action")
+        return checked
+    allowed = np.add.reduceat(checked, _starts(sizes))
+    if not allowed.all():
+        number = int(np.flatnonzero(allowed == 0)[0])
+        raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
+    return checked
+
+
+@functools.cache
+def _starts(sizes: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return where each choice begins in a mask."""
+    return np.cumsum((0, *sizes[:-1]))
