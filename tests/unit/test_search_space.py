@@ -95,7 +95,7 @@ def test_the_log_form_favours_small_values() -> None:
         ({"qrandint": [0, 10, -2]}, "has the step -2"),
         ({"qrandint": [11, 19, 10]}, "no multiple of 10 between 11 and 19"),
         ({"uniform": [0, float("inf")]}, "finite"),
-        ({"uniform": [0, "1"]}, "'1' is not a number"),
+        ({"uniform": [0, "1"]}, "'1' is of the wrong type: write 1 if that is meant"),
         ({"uniform": [False, 1]}, "false is not a number"),
         ({"randint": [0, 1.5]}, "1.5"),
         ({"uniform": [1]}, "Field required"),

@@ -216,6 +216,56 @@ def test_a_dotted_name_of_a_hyperparameter_is_compared_part_by_part() -> None:
     assert "'a.b'. It has activation" in message
 
 
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ("hyperparams: {lr:1e-3}", "hyperparams.lr:1e-3: ppo has no hyperparameter 'lr:1e-3': write a space after the"),
+        ("hyperparams: {lr:1e-3}", "after the colon, lr: 1e-3"),
+        ("hyperparams:\n  lr:1e-3", "hyperparams: 'lr:1e-3' is one word: write a space after the colon, lr: 1e-3"),
+        ("hyperparams:\n  lr:1e-3\n  gamma:0.9", "gamma:0.9' is one word: write a space after the colon, lr: 1e-3"),
+        ("space:\n  lr:1e-3", "space: 'lr:1e-3' is one word: write a space after the colon, lr: 1e-3"),
+        ("stop: {time_s:60}", "there is no field 'time_s:60' here: write a space after the colon, time_s: 60"),
+        ("stop:\n  time_s:60", "stop: 'time_s:60' is one word: write a space after the colon, time_s: 60"),
+        (
+            "env: {id: CartPole-v1, args: size:5}",
+            "args: 'size:5' is one word: write a space after the colon, size: 5",
+        ),
+    ],
+)
+def test_a_missing_space_after_a_colon_is_told(tmp_path: Path, lines: str, told: str) -> None:
+    env = "" if lines.startswith("env") else "env: CartPole-v1\n"
+    with pytest.raises(SpecError) as caught:
+        load_spec(write(tmp_path, f"{env}algorithm: ppo\n{lines}\n"))
+    assert told in caught.value.message
+    assert "It has activation" not in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"num_samples": "4"}, "num_samples: '4' is of the wrong type: write 4 if that is meant"),
+        ({"hyperparams": {"lr": "3e-4"}}, "hyperparams.lr: '3e-4' is of the wrong type: write 0.0003 if that is meant"),
+        (
+            {"space": {"lr": {"loguniform": ["1e-4", 1]}}},
+            "[0]: '1e-4' is of the wrong type: write 0.0001 if that is me",
+        ),
+        ({"num_samples": "1,000"}, "num_samples: '1,000' is of the wrong type: write 1000 if that is meant"),
+        ({"stop": {"time_s": "1e999"}}, "stop.time_s: '1e999' is not a number"),
+        ({"stop": {"time_s": "nan"}}, "stop.time_s: 'nan' is not a number"),
+        ({"stop": {"time_s": "1,5"}}, "stop.time_s: '1,5' is not a number"),
+    ],
+)
+def test_a_number_in_quotes_is_answered_in_one_wording(fields: dict[str, Any], told: str) -> None:
+    assert told in present(problem_with({**MINIMAL, **fields}))
+
+
+def test_what_is_no_field_of_env_may_be_an_argument_of_the_environment() -> None:
+    message = present(problem_with({**MINIMAL, "env": {"id": "CartPole-v1", "size": 5}}))
+    assert message.endswith("failure_penalty. Arguments of the environment go under env.args.")
+    message = present(problem_with({**MINIMAL, "env": {"id": "CartPole-v1", "frame_stak": 5}}))
+    assert "Did you mean 'frame_stack'? Arguments of the environment go under env.args." in message
+
+
 def test_a_search_that_is_no_is_told_where_it_stands(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r"sweep.yaml, line 3, column 9: no may mean false or a text"):
         load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nsearch: no\n"))

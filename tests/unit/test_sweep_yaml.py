@@ -106,6 +106,38 @@ def test_what_has_two_meanings_or_none_is_refused_with_both_and_its_place(text: 
         assert part in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "message", "hint"),
+    [
+        (
+            "a: {b: 150,000}",
+            "line 1, column 8: 150,000 is 150 and 000 here, as commas separate",
+            "Write 150000 or 150_000.",
+        ),
+        (
+            "a: {b: -1,500,000, c: 2}",
+            "column 8: -1,500,000 is -1 and 500 and 000 here",
+            "Write -1500000 or -1_500_000.",
+        ),
+        ("a: {b: 1,500,500}", "1,500,500 is 1 and 500 and 500 here", "Write 1500500 or 1_500_500."),
+        ("a: {b: 0,001}", "0,001 is 0 and 001 here", "Write 0.001 with a point"),
+        ("a: {b: 1,5}", "1,5 is 1 and 5 here", "Write 1.5 with a point"),
+    ],
+)
+def test_a_comma_in_a_number_is_told_with_the_number(text: str, message: str, hint: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        parse_yaml(text, "x.yaml")
+    assert message in caught.value.message
+    assert hint in caught.value.hint
+
+
+def test_keys_of_digits_may_stay_empty_where_no_number_is_before_them() -> None:
+    assert parse_yaml("{a: x, 000}", "x") == {"a": "x", "000": None}
+    assert parse_yaml("{000, 1: 3, 5: 2}", "x") == {"000": None, "1": 3, "5": 2}
+    assert parse_yaml("{a: 1, 2: }", "x") == {"a": 1, "2": None}
+    assert parse_yaml("a: 1\n000:\n", "x") == {"a": 1, "000": None}
+
+
 def test_keys_are_texts_as_they_are_written() -> None:
     assert parse_yaml("{no: 1, 010: 2, 1: 3, true: 4, ~: 5}", "x") == {"no": 1, "010": 2, "1": 3, "true": 4, "~": 5}
 

@@ -73,7 +73,7 @@ def wrong(domain: Any, **fields: Any) -> str:
         ({"grid": LENGTHS}, {"stop": {"num_env_steps": 9_000}}, "stop.num_env_steps: is 9,000, but the length of "),
         ({"choice": [0, 5]}, {}, f"space.{TRAINING_LENGTH}.choice[0]: 0 is not allowed: it should be at least 1"),
         ({"choice": [2.5, 5]}, {}, f"space.{TRAINING_LENGTH}.choice[0]: 2.5 is not allowed: it should be a whole"),
-        ({"choice": ["5", 5]}, {}, "'5' is not a number"),
+        ({"choice": ["5", 5]}, {}, "'5' is of the wrong type: write 5 if that is meant"),
         ({"choice": [True, 5]}, {}, "true is not a number"),
         ({"loguniform": [10, 99]}, {}, "stop.num_env_steps must be a whole number: use lograndint"),
         ({"randint": [-5, 99]}, {}, "-5 is not allowed: it should be at least 1"),

@@ -22,10 +22,13 @@ from typing_extensions import override
 
 from analysis.wording import is_number
 from tune_jobs.spec.plain_data import yaml_text
+from tune_jobs.spec.slips import number_in
 
 
 def _refuse_coercion(value: Any) -> Any:
     # Pydantic would read true as 1 and "5" as 5, but a quoted or misspelt value is better refused than guessed.
+    if isinstance(value, str) and (meant := number_in(value)) is not None:
+        raise ValueError(f"{yaml_text(value)} is of the wrong type: write {meant!r} if that is meant")
     if isinstance(value, bool | str):
         raise ValueError(f"{yaml_text(value)} is not a number")  # noqa: TRY004 - pydantic reports ValueErrors only
     return value

@@ -24,6 +24,7 @@ from tune_jobs.spec.list_forms import list_to_write, text_of_several
 from tune_jobs.spec.plain_data import yaml_text
 from tune_jobs.spec.problems import SPEC_HINT, Problem
 from tune_jobs.spec.sections import StopSpec
+from tune_jobs.spec.slips import text_of_no_space
 
 _LENGTHS = dict.fromkeys(
     ("num_env_steps", "stop", TRAINING_LENGTH),
@@ -118,6 +119,8 @@ def as_taken(algorithm: Algorithm, name: str, value: Any) -> Any:
 def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     if name in _LENGTHS:
         return f"{algorithm} has no hyperparameter {name!r}. {_LENGTHS[name]}"
+    if (spaced := text_of_no_space(name)) is not None:
+        return f"{algorithm} has no hyperparameter {name!r}: {spaced}"
     if did_you_mean(name, ["when"], cutoff=0.75):
         return f"{algorithm} has no hyperparameter {name!r}. {_CONDITION}"
     if name.startswith("stop."):

@@ -20,6 +20,7 @@ from tune_jobs.spec.layers import LayersFields
 from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
 from tune_jobs.spec.problems import Problem
 from tune_jobs.spec.sections import NAME_RULE, SweepFields
+from tune_jobs.spec.slips import text_of_no_space
 
 
 def problems_of(error: ValidationError, data: Any) -> list[Problem]:
@@ -90,7 +91,7 @@ def _from_detail(detail: Detail) -> Problem:
     if detail["type"] == "missing":
         options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
         return Problem(path, f"is missing{f': give {options}' if options else ''}")
-    if (written := _in_space(location, detail)) is not None:
+    if (written := _in_space(location, detail) or _of_one_word(detail)) is not None:
         return Problem(path, written)
     if path in _FORMS and detail["type"] != "value_error":
         return Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")
@@ -111,6 +112,12 @@ def _in_space(location: Sequence[int | str], detail: Detail) -> str | None:
     return None
 
 
+def _of_one_word(detail: Detail) -> str | None:
+    """Return what to write where a mapping has become one word for want of a space; None: this is not the mistake."""
+    spaced = text_of_no_space(detail["input"]) if detail["type"] in ("dict_type", "model_type") else None
+    return None if spaced is None else f"{shortened(detail['input'])} is one word: {spaced}"
+
+
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:
     """Drop pydantic's names for the members of unions: of a domain's kind, and of the domain of layers' sizes."""
     parts = list(location)
@@ -123,12 +130,15 @@ def _without_tags(location: Iterable[int | str]) -> list[int | str]:
 
 def _unknown_key(location: Sequence[int | str]) -> str:
     name, model = str(location[-1]), _section(location[:-1])
+    if (spaced := text_of_no_space(name)) is not None:
+        return f"there is no field {name!r} here: {spaced}"
     if "." in name:
         return f"there is no field {name!r} here{_of_a_path(name, model)}"
     # A field of exactly this name in another section is more likely meant than a similar one here.
     suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
     listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
-    return f"there is no field {name!r} here.{suggestion}{listed}"
+    arguments = " Arguments of the environment go under env.args." if list(location[:-1]) == ["env"] else ""
+    return f"there is no field {name!r} here.{suggestion}{listed}{arguments}"
 
 
 def _section(location: Sequence[int | str]) -> type[BaseModel]:

@@ -135,6 +135,7 @@ class _Loader(yaml.SafeLoader):
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         """Compose a mapping; its keys are strings as they are written, and must not occur twice."""
         node: yaml.MappingNode = super().compose_mapping_node(anchor)
+        _refuse_commas(node)
         seen: set[str] = set()
         for index, (key, value) in enumerate(node.value):
             if not isinstance(key, yaml.ScalarNode):
@@ -173,6 +174,34 @@ def _check_extent(extent: _Extent) -> None:
             shown = f"{number:,}" if number < 10**18 else "more than 10^18"
             problem = f"with its aliases it stands for {shown} {what}; at most {limit:,} are read."
             raise yaml.MarkedYAMLError(problem=problem, note=_SMALLER)
+
+
+def _refuse_commas(node: yaml.MappingNode) -> None:
+    """Refuse `{num_env_steps: 150,000}`, which YAML reads as 150 and a key 000 without a value."""
+    for index, (_, value) in enumerate(node.value if node.flow_style else ()):
+        if not _is_plain(value, r"[-+]?[0-9]+"):
+            continue
+        parts, end = [value.value], value.end_mark.index
+        for key, nothing in itertools.islice(node.value, index + 1, None):
+            if not (_is_plain(key, "[0-9]+") and _is_plain(nothing, "") and key.start_mark.index == end + 1):
+                break
+            parts.append(key.value)
+            end = key.end_mark.index
+        if len(parts) == 1:
+            continue
+        number, *groups = parts
+        hint = "Write the number without commas."
+        if number.lstrip("+-0") and len(number.lstrip("+-")) <= 3 and all(len(group) == 3 for group in groups):
+            hint = f"Write {''.join(parts)} or {'_'.join(parts)}."
+        elif len(groups) == 1:
+            hint = f"Write {'.'.join(parts)} with a point."
+        read = " and ".join(parts)
+        raise _error(value, f"{','.join(parts)} is {read} here, as commas separate what is in braces", hint)
+
+
+def _is_plain(node: yaml.Node, pattern: str) -> bool:
+    """Whether a node is a word without quotes that matches a pattern as a whole."""
+    return isinstance(node, yaml.ScalarNode) and node.style is None and re.fullmatch(pattern, node.value) is not None
 
 
 def _whole_number(loader: _Loader, node: yaml.ScalarNode) -> int:
