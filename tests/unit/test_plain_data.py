@@ -2,10 +2,12 @@
 
 import collections
 import enum
+import functools
 import json
 from pathlib import Path
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from spec_errors import MINIMAL
@@ -122,3 +124,31 @@ def test_what_contains_itself_or_is_too_deep_is_refused() -> None:
         deep = [deep]
     with pytest.raises(SpecError, match="nested more than 64 deep"):
         load_spec({"env": deep})
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: {"id": env}], ids=["env", "env.id"])
+def test_an_environment_that_is_an_object_is_answered_with_how_its_class_is_given(wrap: Any) -> None:
+    with pytest.raises(SpecError, match="which JSON can't hold") as caught:
+        load_spec({**MINIMAL, "env": wrap(gym.Env())})
+    assert caught.value.hint == (
+        "Give the class itself, with its arguments under args, as in {'id': MyEnv, 'args': {...}}; or a Gymnasium id."
+    )
+
+
+@pytest.mark.parametrize(
+    "env", [lambda: gym.make("CartPole-v1"), functools.partial(gym.make, "CartPole-v1")], ids=["lambda", "partial"]
+)
+def test_an_environment_that_is_a_function_is_answered_with_how_it_is_registered(env: Any) -> None:
+    with pytest.raises(SpecError, match="which JSON can't hold") as caught:
+        load_spec({**MINIMAL, "env": env})
+    assert caught.value.hint == (
+        "Register it with gymnasium.register in a module of your own, and give the id after the module, as in "
+        "my_envs:Name-v0."
+    )
+
+
+def test_what_is_no_environment_is_answered_with_what_a_sweep_holds() -> None:
+    for fields in ({"env": b"x"}, {"env": {"id": "x", "args": {"make": print}}}):
+        with pytest.raises(SpecError) as caught:
+            load_spec({**MINIMAL, **fields})
+        assert caught.value.hint.startswith("Give texts, numbers, true or false")

@@ -47,6 +47,22 @@ def yaml_text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else shortened(value)
 
 
+def _instead_of(value: Any, path: str) -> str:
+    """Return what to give in place of an object; classes of environments have been replaced by their names already."""
+    is_env = path in ("env", "env.id") and not isinstance(value, type)
+    if is_env and hasattr(type(value), "step"):
+        return (
+            "Give the class itself, with its arguments under args, as in {'id': MyEnv, 'args': {...}}; or a Gymnasium "
+            "id."
+        )
+    if is_env and callable(value):
+        return (
+            "Register it with gymnasium.register in a module of your own, and give the id after the module, as in "
+            "my_envs:Name-v0."
+        )
+    return "Give texts, numbers, true or false, None, lists and mappings of them."
+
+
 class _Copy:
     def __init__(self, label: str) -> None:
         self._label = label
@@ -69,10 +85,7 @@ class _Copy:
         if value is None or isinstance(value, bool):
             return value
         kind = f"the class {value.__qualname__}" if isinstance(value, type) else f"of type {type(value).__name__}"
-        raise self._error(
-            path, f"{shortened(value)} is {kind}, which JSON can't hold",
-            "Give texts, numbers, true or false, None, lists and mappings of them.",
-        )  # fmt: skip
+        raise self._error(path, f"{shortened(value)} is {kind}, which JSON can't hold", _instead_of(value, path))
 
     def _of_python(self, value: Any, path: str) -> Any:
         """Return NumPy's values, paths and models as Python's own types."""
