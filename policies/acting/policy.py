@@ -28,7 +28,8 @@ from policies import random_streams
 from policies.envs.action_bounds import ToBounds
 from policies.envs.flat import FlatBox
 from policies.envs.make import check_env
-from policies.envs.masks import FORBIDDEN, MaskedBox, draw_allowed, num_masked
+from policies.envs.mask_hints import argument_hint
+from policies.envs.masks import ACTION_MASK, FORBIDDEN, MaskedBox, draw_allowed, num_masked
 from policies.envs.own_actions import Choices, is_made, own_actions
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
@@ -104,8 +105,8 @@ class Policy(ABC):
             batch = np.asarray(observations, dtype=np.float32)
         except (TypeError, ValueError) as error:
             hint = "Pass what env.reset or env.step returned"
-            if isinstance(space, MaskedBox) and space.key is None:
-                hint += ', and mask=info["action_mask"], or what the environment calls it'
+            if isinstance(space, MaskedBox):
+                hint += argument_hint(space, self.env_args.get(ACTION_MASK))
             raise ObservationError(
                 f"Observations of {self.env_id} must be {self._wanted()}: {error}.", f"{hint}."
             ) from error

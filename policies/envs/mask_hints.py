@@ -1,4 +1,4 @@
-"""Suggest what an environment's mask of actions is called, where it is not found by the name that was given."""
+"""Suggest what an environment's mask of actions is called, where it is not found, or not given."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from policies.envs.mask_values import checked_mask
-from policies.envs.masks import ACTION_MASK, member_problem, needs_nothing
+from policies.envs.masks import ACTION_MASK, METHOD, MaskedBox, Setting, member_problem, needs_nothing
 from policies.envs.own_actions import sizes_of
 
 _LIKE_MASKS = re.compile("mask|legal|valid|allowed")
@@ -27,6 +27,23 @@ def mask_hint(env: gym.Env[Any, Any], infos: Any) -> str:
     if not names:
         return f"Set env.{ACTION_MASK}: false, or leave it out: nothing of the env looks like a mask."
     return f"Write env.{ACTION_MASK}: {' or '.join(dict.fromkeys(names))}; or false, if that is no mask."
+
+
+def argument_hint(space: MaskedBox, setting: Setting) -> str:
+    """Say how to give a policy the mask, as words behind what else it is given; nothing, if that has the mask.
+
+    Args:
+        space: What the policy observes.
+        setting: What the environment's arguments say of its mask.
+    """
+    if space.key is not None:
+        return ""
+    if space.original is None:
+        return ", and the newest mask of the environment as mask="
+    name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
+    called = f'mask=env.get_wrapper_attr("{method}")()'
+    # Without a setting, a mask that is no member is a method.
+    return f", and {called}" if setting is None else f', and mask=info["{name}"], or {called} if it is a method'
 
 
 def _infos(env: gym.Env[Any, Any], infos: Any) -> Iterator[str]:

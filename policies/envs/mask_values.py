@@ -52,3 +52,12 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
 def _starts(sizes: tuple[int, ...]) -> NDArray[np.int64]:
     """Return where each choice begins in a mask."""
     return np.cumsum((0, *sizes[:-1]))
+
+
+def is_one_mask(mask: Any) -> bool:
+    """Whether something is numbers of one mask, and not several masks."""
+    try:
+        values = np.asarray(mask)
+    except ValueError:  # ragged lists, as of several choices
+        return False
+    return values.ndim < 2 and values.size > 0 and values.dtype.kind in "biuf"

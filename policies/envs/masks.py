@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from policies.envs.flat import FlatBox, needs_flattening
-from policies.envs.mask_values import MaskProblemError, checked_mask
+from policies.envs.mask_values import MaskProblemError, checked_mask, is_one_mask
 from policies.envs.own_actions import sizes_of
 from policies.errors import EnvError, shortened
 
@@ -111,7 +111,7 @@ class MaskedBox(gym.spaces.Box):
             elif isinstance(observations, list) and observations and isinstance(observations[0], Mapping):
                 mask = [self._mask_in(one) for one in observations]
         if mask is None:
-            if np.shape(observations)[-1:] != self.shape:
+            if not self._begins(observations):
                 raise ValueError("there is no mask")
             return observations
         seen = self.seen
@@ -123,10 +123,19 @@ class MaskedBox(gym.spaces.Box):
         vectors = vectors[..., -seen.shape[0] :]
         if vectors.ndim == 1:
             return np.concatenate([self._checked(mask), vectors])
+        if is_one_mask(mask):
+            raise ValueError(f"there is one mask, not one for each of {len(vectors)} observations")
         if len(mask) != len(vectors):
             raise ValueError(f"there are {len(mask)} masks for {len(vectors)} observations")
         masks = np.array([self._checked(one) for one in mask]).reshape(-1, self.num_masked)
         return np.concatenate([masks, vectors], axis=-1)
+
+    def _begins(self, observations: Any) -> bool:
+        """Whether something is a vector that begins with a mask, or a batch of such."""
+        try:
+            return bool(np.shape(observations)[-1:] == self.shape)
+        except ValueError:  # a tuple of members, of which no array can be made
+            return False
 
     def _mask_in(self, observation: Mapping[str, Any]) -> Any:
         if self.key is None or self.key not in observation:

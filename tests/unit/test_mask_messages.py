@@ -11,8 +11,9 @@ import pytest
 from gymnasium import spaces
 from policy_factory import registered
 
+from policies.acting.policy import RandomPolicy
 from policies.envs.make import check_env
-from policies.errors import EnvError
+from policies.errors import EnvError, ObservationError
 
 ENV = "TestHasLegal-v0"
 
@@ -106,3 +107,60 @@ def test_arguments_that_are_shown_are_the_constructors(where: str) -> None:
     with registered("TestBreaks-v0", Breaks), pytest.raises(EnvError) as caught:
         check_env("TestBreaks-v0", args)
     assert f"with arguments {{'where': '{where}', 'number': 2}}" in caught.value.message
+
+
+class Both(HasLegal):
+    """Observes a tuple; its mask is a method, and an info too."""
+
+    def __init__(self) -> None:
+        super().__init__("info")
+        self.observation_space = spaces.Tuple((spaces.Discrete(3), self.observation_space))
+
+    def action_masks(self) -> Any:
+        return np.ones(3, np.int8)
+
+    def _seen(self) -> tuple[Any, dict[str, Any]]:
+        seen, infos = super()._seen()
+        return (1, seen), infos
+
+
+METHOD = 'mask=env.get_wrapper_attr("{}")()'
+
+
+@pytest.mark.parametrize(
+    ("args", "given"),
+    [
+        ({}, f", and {METHOD.format('action_masks')}."),
+        ({"action_mask": "legal"}, f', and mask=info["legal"], or {METHOD.format("legal")} if it is a method.'),
+        (
+            {"action_mask": True},
+            f', and mask=info["action_mask"], or {METHOD.format("action_masks")} if it is a method.',
+        ),
+        ({"frame_stack": 2}, ", and the newest mask of the environment as mask=."),
+    ],
+    ids=str,
+)
+def test_a_policy_without_a_mask_says_where_it_is(args: dict[str, Any], given: str) -> None:
+    with registered("TestBoth-v0", Both):
+        policy = RandomPolicy.for_env("TestBoth-v0", args)
+        own = (1, np.zeros(2, np.float32))
+        for observations in (own, [own, own], np.zeros(2, np.float32)):
+            with pytest.raises(ObservationError, match=r": there is no mask\.") as caught:
+                policy.act(observations)
+            assert caught.value.hint == f"Pass what env.reset or env.step returned{given}"
+        if "frame_stack" not in args:
+            assert policy.act(own, mask=[0, 1, 0]) == 1
+
+
+@pytest.mark.parametrize("num", [1, 2, 3])
+def test_one_mask_is_not_one_for_each_observation(num: int) -> None:
+    with registered("TestBoth-v0", Both):
+        policy = RandomPolicy.for_env("TestBoth-v0")
+        rows = [(1, np.zeros(2, np.float32))] * num
+        # As many numbers as observations, or others.
+        for mask in ([0, 1, 0], np.array([0, 1, 0]), (False, True, False)):
+            with pytest.raises(ObservationError, match=f"one mask, not one for each of {num} observations"):
+                policy.act(rows, mask)
+        assert policy.act(rows, [[0, 1, 0]] * num).tolist() == [1] * num
+        with pytest.raises(ObservationError, match=f"there are {num + 1} masks for {num} observations"):
+            policy.act(rows, [[0, 1, 0]] * (num + 1))
