@@ -377,5 +377,6 @@ def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:
         raise EnvError(
             f"DQN cannot train on {info.env_id}: its actions are {len(space.sizes)} choices at once ({space}), and DQN "
             "needs a single one.",
-            f"Use 'algorithm: ppo', which makes each choice by itself. {one_choice_hint(info.env_id, space.original)}",
+            f"Use 'algorithm: ppo', which makes each choice by itself. "
+            f"{one_choice_hint(info.env_id, space.original, info.mask)}",
         )

@@ -72,8 +72,20 @@ def action_hint() -> str:
     return f"{_HOW}, in a gymnasium.ActionWrapper whose actions are all choices, or all numbers."
 
 
-def one_choice_hint(env_id: str, space: gym.Space[Any]) -> str:
-    """Suggest what turns several choices at once into a single one."""
+def one_choice_hint(env_id: str, space: gym.Space[Any], mask: str | None = None) -> str:
+    """Suggest what turns several choices at once into a single one.
+
+    Args:
+        env_id: The env's id.
+        space: The space of its actions.
+        mask: Where its mask of them is, in words; None: it has none.
+    """
+    if mask is not None:
+        # No wrapper of Gymnasium's changes a mask.
+        return (
+            f"{_HOW}, in a gymnasium.ActionWrapper with one Discrete action for each combination, and have {mask} say "
+            "which combinations are allowed: a zero or a one for each, not for each value of each choice."
+        )
     env = _make(env_id)
     sizes = _combinations(space)
     if sizes is not None and math.prod(sizes) <= _MAX_COMBINATIONS:

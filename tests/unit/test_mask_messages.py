@@ -164,3 +164,28 @@ def test_one_mask_is_not_one_for_each_observation(num: int) -> None:
         assert policy.act(rows, [[0, 1, 0]] * num).tolist() == [1] * num
         with pytest.raises(ObservationError, match=f"there are {num + 1} masks for {num} observations"):
             policy.act(rows, [[0, 1, 0]] * (num + 1))
+
+
+def test_dqn_has_one_mask_for_combinations_of_choices() -> None:
+    with registered("TestTwo-v0", Two):
+        with pytest.raises(EnvError, match="2 choices at once") as caught:
+            check_env("TestTwo-v0", {}, "dqn")
+        assert caught.value.hint.startswith("Use 'algorithm: ppo'")
+        # The expression would change the actions, and not the mask.
+        assert "TransformAction" not in caught.value.hint
+        assert "and have action_masks() say which combinations are allowed" in caught.value.hint
+        with pytest.raises(EnvError, match="2 choices at once") as caught:
+            check_env("TestTwo-v0", {"action_mask": False}, "dqn")
+        assert "TransformAction" in caught.value.hint
+
+
+class Two(HasLegal):
+    """Two choices at once, with a mask."""
+
+    action_space: Any = spaces.MultiDiscrete([3, 2])
+
+    def __init__(self) -> None:
+        super().__init__("method")
+
+    def action_masks(self) -> Any:
+        return np.ones(5, np.int8)
