@@ -96,7 +96,8 @@ def job(number: Annotated[int, PathParameter(ge=1, le=2**53, description="Its id
 
 
 def _plain(status: SweepStatus) -> dict[str, Any]:
-    found = {field.name: getattr(status, field.name) for field in fields(status)}
+    # Where the sweep is concerns this machine alone.
+    found = {field.name: getattr(status, field.name) for field in fields(status) if field.name != "place"}
     return {**found, "sweep": json.loads(status.sweep.model_dump_json())}
 
 
