@@ -103,7 +103,7 @@ def test_a_sweep_that_has_made_nothing_says_so(live: Live) -> None:
 def test_a_policy_that_was_chosen_before_its_sweep_was_extended_is_not_its_best(live: Live, store: SweepStore) -> None:
     assert get(live, "/best").json()["checkpoint"]["trial_id"] == "t0003"
     extend_by_leaders(store)
-    for path in ("/best", "/policy", "/policy/policy.json"):
+    for path in ("/best", "/policy", "/policy/policy.json", "/play"):
         assert "chosen before the sweep was trained on" in problem(get(live, path), 404)
         assert get(live, path).json()["hint"] == "Resume it: then one is chosen anew."
     assert {item["path"].split("/")[0] for item in get(live, "/files").json()} == {"report"}

@@ -12,12 +12,12 @@ from fastapi import Path as PathParameter
 from analysis.front_view import FrontView
 from policies.errors import NotFoundError
 from policies.portable.file import policy_files
+from tune_jobs.service.http.best_policy import has_best, no_best
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.downloads import NO_SCRIPTS, SANDBOX, Archive, Download, attachment
 from tune_jobs.service.http.models import FileOfSweep
 from tune_jobs.service.service import Service
 from tune_jobs.store.contract import Sweep
-from tune_jobs.sweeps.current_best import has_best_to_show
 from tune_jobs.sweeps.outcome import Film
 from tune_jobs.sweeps.plain import to_json
 
@@ -43,7 +43,7 @@ def files(name: str, service: TheService) -> list[FileOfSweep]:
     """List what can be downloaded of a sweep: its report, films and policy."""
     sweep = _sweep(service, name)
     known = {f"report/{path}": file for path, file in sweep.report_files().items()}
-    if _has_best(service, sweep):
+    if has_best(service, sweep):
         known |= {f"films/{film}": file for film, file in sweep.films().items()}
         known |= {f"policy/{path}": file for path, file in policy_files(sweep.best_folder).items()}
     return [item for path, file in known.items() if (item := _described(path, file)) is not None]
@@ -106,24 +106,10 @@ def policy_file(name: str, file: str, service: TheService) -> Download:
 
 def _policy_files(service: Service, name: str) -> Mapping[str, Path]:
     sweep = _sweep(service, name)
-    found = policy_files(sweep.best_folder) if _has_best(service, sweep) else {}
+    found = policy_files(sweep.best_folder) if has_best(service, sweep) else {}
     if not found:
-        raise _no_best(sweep)
+        raise no_best(sweep)
     return found
-
-
-def _has_best(service: Service, sweep: Sweep) -> bool:
-    seen = service.statuses.see(sweep.name)
-    return has_best_to_show(sweep, seen.status.sweep, seen.trials.records)
-
-
-def _no_best(sweep: Sweep) -> NotFoundError:
-    if sweep.has_best():
-        return NotFoundError(
-            f"The best policy of sweep {sweep.name} was chosen before the sweep was trained on.",
-            "Resume it: then one is chosen anew.",
-        )
-    return NotFoundError(f"Sweep {sweep.name} has no best policy yet.", "It is chosen when the sweep has ended.")
 
 
 @router.get(
@@ -157,8 +143,8 @@ def best(name: str, service: TheService) -> dict[str, Any]:
     """Return the policy to deploy and the setting to train with, as `tune-jobs best --json` prints them."""
     sweep = _sweep(service, name)
     # The store's message names the command that chooses it, which is the one that a client was given.
-    if not _has_best(service, sweep):
-        raise _no_best(sweep)
+    if not has_best(service, sweep):
+        raise no_best(sweep)
     found: dict[str, Any] = to_json(sweep.read_best())
     return found
 

@@ -18,6 +18,7 @@ from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from policies.errors import NotFoundError
+from tune_jobs.service.http.best_policy import has_best, no_best
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.problems import TooManyError
 from tune_jobs.service.player import LEAST_SPEED, MAX_STEPS, MOST_SPEED
@@ -156,8 +157,8 @@ def _request(
     if random:
         policy = "random"
     elif trial is None:
-        if not sweep.has_best():
-            raise NotFoundError(f"Sweep {name} has no best policy yet.", "Choose a trial that has a checkpoint.")
+        if not has_best(service, sweep):
+            raise no_best(sweep)
         policy = str(sweep.best_folder)
     else:
         kept = sweep.trial(trial).checkpoint_iterations()
