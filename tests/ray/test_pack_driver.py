@@ -245,11 +245,13 @@ def test_whoever_has_ended_is_compared_with_too(tmp_path: Path) -> None:
     # With what it had at its end.
     driven.tell(t0000=(200, "completed"), t0001=(200, 0.5))
     assert driven.assigned() == [2, 3, 4]
-    # 1, which is ended at the second rung, counts at the first one too, where it was never seen.
+    # 0 and 1, which is ended at the second rung, don't count at the first one, where they were never seen.
     driven = Driven(tmp_path / "b", 3, num_packs=1, slots=3, scheduler=ASHA)
     driven.tell(t0000=(400, 9.0), t0001=(400, 1.0))
     assert driven.assigned() == [0, 2]
     driven.tell(t0002=(200, 0.5))
+    assert driven.assigned() == [0, 2]
+    driven.tell(t0002=(400, 0.5))
     assert driven.assigned() == [0]
 
 
