@@ -21,7 +21,6 @@ from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo, check_env, make_env, make_vector_env
-from policies.envs.mask_values import MaskProblemError, checked_mask
 from policies.envs.masks import FORBIDDEN, MaskedBox
 from policies.envs.spaces import describe_space, space_from_description
 from policies.errors import CheckpointError, EnvError, ObservationError
@@ -231,35 +230,6 @@ def test_a_step_without_a_mask_fails_the_trial_and_no_other(place: str, goes_wro
     envs.close()
     with pytest.raises(EnvError, match=words):
         evaluate_policy(RandomPolicy.for_env(ENV, args), env_id=ENV, env_args=args, seeds=[1])
-
-
-@pytest.mark.parametrize(
-    ("mask", "sizes", "words"),
-    [
-        ([0, 0], (2,), "forbids every action"),
-        ([1, 1, 0, 0, 1], (2, 2, 1), "forbids every value of choice 1, counted from 0"),
-        ([1, 1, 1], (2,), "not 2 zeros and ones"),
-        ([0.5, 1], (2,), "not zeros and ones"),
-        ([np.nan, 1], (2,), "not zeros and ones"),
-        (["1", "0"], (2,), "not 2 zeros and ones"),
-        (None, (2,), "not 2 zeros and ones"),
-        ({"a": 1}, (2,), "not 2 zeros and ones"),
-        ([[1], [1, 0, 1]], (2,), "not 2 zeros and ones"),
-    ],
-    ids=str,
-)
-def test_what_is_no_mask(mask: Any, sizes: tuple[int, ...], words: str) -> None:
-    with pytest.raises(MaskProblemError, match=words):
-        checked_mask(mask, sizes)
-
-
-@pytest.mark.parametrize(
-    "mask", [np.array([1, 0, 1]), [True, False, True], [1.0, 0.0, 1.0], ([1, 0], np.array([1], np.int8))], ids=str
-)
-def test_what_is_a_mask(mask: Any) -> None:
-    found = checked_mask(mask, (2, 1))
-    assert found.dtype == np.float32
-    assert found.tolist() == [1, 0, 1]
 
 
 # -- acting

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, return_text, setting_text
-from tune_jobs.store.opening import open_sweep, resume_command
 from tune_jobs.sweeps.plain import to_json
 
 if TYPE_CHECKING:
@@ -55,6 +54,9 @@ def show_result(result: SweepResult, *, as_json: bool) -> None:
             notes=result.notes,
         )  # fmt: skip
     if result.interrupted:
+        # Most commands that print something need no store, which takes as long to load as all else here.
+        from tune_jobs.store.opening import open_sweep, resume_command
+
         say_interrupted(result.sweep, resume_command(open_sweep(result.place), result.sweep))
 
 
