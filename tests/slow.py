@@ -14,7 +14,8 @@ VARIABLE = "TUNE_JOBS_SLOW"
 _LEARN = "`make learn` trains every preset over five seeds"
 
 SLOW = {
-    "tests/cluster/test_autoscaler.py": "tests/unit/test_waiting_for_nodes.py, and tests/unit/test_autoscaler.py",
+    "tests/cluster/test_autoscaled_cluster.py":
+        "tests/unit/test_waiting_for_nodes.py, and tests/unit/test_autoscaler.py",
     "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[rllib-crash]":
         "the same, packed",
     "tests/cluster/test_cluster.py::test_a_trial_goes_on_elsewhere_when_its_node_is_lost[packed-drain]":
@@ -26,7 +27,6 @@ SLOW = {
     "tests/learning/test_packed_dqn_learning.py::test_a_pack_of_dqn_trials_solves_cartpole": _LEARN,
     "tests/learning/test_packed_learning.py::test_a_pack_learns_as_rllib_does": "tests/ray/test_packed_ppo.py",
     "tests/package/test_docker.py": "tests/package/test_docker_files.py, and test_wheel.py for what is installed",
-    "tests/ray/test_baseline_sweeps.py": "tests/integration/test_baseline_sweeps.py",
     "tests/ray/test_chosen_points.py::test_it_is_chosen_if_it_is_the_best_and_confirmed": "the others of its file",
     "tests/ray/test_chosen_points.py::test_its_values_act_in_each_of_its_seeds_and_the_others_stay_as_they_are[rllib]":
         "the same, packed",
@@ -49,6 +49,7 @@ SLOW = {
     "tests/ray/test_pack_interruption.py::test_members_go_on_from_their_checkpoints_after_a_kill_and_an_interruption":
         "`make kills`, and tests/ray/test_interruption.py",
     "tests/ray/test_packs.py::test_members_of_a_pack_that_dies_again_go_on_alone": "tests/ray/test_pack_driver.py",
+    "tests/ray/test_random_play.py": "tests/integration/test_baseline_sweeps.py",
     "tests/ray/test_schedulers.py::test_a_trial_without_a_finite_score_never_runs_on[hyperband]":
         "the same, asha, and tests/ray/test_hyperband.py",
     "tests/ray/test_schedulers.py::test_every_scheduler_runs_to_the_end[hyperband]": "tests/ray/test_hyperband.py",

@@ -144,8 +144,9 @@ def _values(field: Schema, links: Mapping[str, str]) -> list[str]:
         return [f"[{', '.join(words for item in field['prefixItems'] for words in _values(item, links))}]"]
     if "items" in field:
         return [f"list of: {words}" for words in _values(field["items"], links)]
-    if "enum" in field:
-        return [", ".join(f"`{value}`" for value in field["enum"])]
+    words = [field["const"]] if "const" in field else field.get("enum")
+    if words is not None:
+        return [", ".join(f"`{word}`" for word in words)]
     return [" ".join(filter(None, (_TYPES[field.get("type", "object")], range_text(field))))]
 
 
@@ -165,7 +166,8 @@ def _without_null(field: Schema) -> Schema:
 
 
 def _default(field: Schema) -> str:
-    if "default" in field:
+    # No text is no word in a cell.
+    if field.get("default", "") != "":
         default = field["default"]
         return f"`{default if isinstance(default, str) else json.dumps(default)}`"
     return "" if _section(field) is not None else "empty"

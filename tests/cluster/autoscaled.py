@@ -2,8 +2,8 @@
 
     python -m tests.cluster.autoscaled FOLDER
 
-Ray's autoscaler for tests ends nodes by itself, so this runs in namespaces of its own (`test_autoscaler`), where no
-other Ray is. It prints one JSON document: what each sweep said, and the most that it asked for and got.
+Ray's autoscaler for tests ends nodes by itself, so this runs in namespaces of its own (`test_autoscaled_cluster`),
+where no other Ray is. It prints one JSON document: what each sweep said, and the most that it asked for and got.
 """
 
 from __future__ import annotations

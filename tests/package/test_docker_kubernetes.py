@@ -260,13 +260,12 @@ def test_a_job_resumes_its_sweep_or_launches_it(folder: str, kind: str) -> None:
     job = manifest["spec"].get("jobTemplate", manifest["spec"])
     assert job["submissionMode"] == "HTTPMode"
     assert job["backoffLimit"] > 0
-    commands = re.findall(r"tune-jobs (\w+) ([^|;]*)", job["entrypoint"])
+    commands = re.findall(r"tune-jobs (\w+) ([^;]*); code=\$\?", job["entrypoint"])
     assert [name for name, _ in commands] == ["resume", "launch"]
     given = cli.commands["launch"].make_context("launch", commands[1][1].split()).params
     assert given["address"] == "auto"
     assert given["wait_for_nodes"] > 0
     assert commands[0][1].split()[0] == given["name"]
-    assert "[ $? -eq 4 ]" in job["entrypoint"]
     head = job["rayClusterSpec"]["headGroupSpec"]["template"]["spec"]
     (volume,) = [one for one in head["volumes"] if one["name"] == "files"]
     (files,) = [
@@ -275,6 +274,37 @@ def test_a_job_resumes_its_sweep_or_launches_it(folder: str, kind: str) -> None:
     assert given["spec"] == "/files/sweep.yaml"
     assert list(files["data"]) == ["sweep.yaml"]
     assert load_spec(FOLDER / folder / "sweep.yaml").algorithm == "ppo"
+
+
+@pytest.mark.parametrize(("folder", "kind"), [("sweep", "RayJob"), ("nightly", "RayCronJob")])
+@pytest.mark.parametrize(
+    ("codes", "code"),
+    [([0], 0), ([3], 0), ([4, 0], 0), ([4, 3], 0), ([4, 2], 2), ([4, 5], 5), ([2], 2), ([5], 5), ([130], 130)],
+)
+def test_a_job_fails_unless_its_sweep_is_over(
+    folder: str, kind: str, codes: list[int], code: int, tmp_path: Path
+) -> None:
+    """As Ray's job server runs the entrypoint: with a shell, and what it prints is the job's log."""
+    (manifest,) = of_kind(render(FOLDER / folder, component=FOLDER / "storage-pvc"), kind)
+    entrypoint = manifest["spec"].get("jobTemplate", manifest["spec"])["entrypoint"]
+    program = tmp_path / "tune-jobs"
+    program.write_text(f'#!/bin/sh\necho "$1 $2 $4"\n[ "$1" = resume ] && exit {codes[0]}\nexit {codes[-1]}\n')
+    program.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["/bin/sh", "-c", entrypoint], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (code, "")
+    first, *rest = done.stdout.splitlines()
+    name = first.split()[1]
+    assert first.startswith(f"resume {name}")
+    assert re.fullmatch(r"cartpole(-\d{4}-\d\d-\d\d)?", name)
+    if len(codes) == 2:
+        assert rest.pop(0) == f"launch /files/sweep.yaml {name}"
+    if codes[-1] == 3:
+        (said,) = rest
+        assert said.startswith(f"The sweep {name} is over, but trials failed")
+        assert said.endswith(f"tune-jobs trials {name}")
+    else:
+        assert rest == []
 
 
 def test_the_service_is_asked_for_what_it_has(storage: str) -> None:

@@ -25,7 +25,7 @@ MOST_WORDS = 1_300
 
 
 class Page(HTMLParser):
-    """What a page links to and loads, its anchors and its text."""
+    """What a page links to and loads, its anchors, its text, and that of its paragraphs and of its tables' rows."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -33,10 +33,20 @@ class Page(HTMLParser):
         self.loads: list[str] = []
         self.anchors: set[str] = set()
         self.text = ""
+        self.paragraphs: list[str] = []
+        self.rows: list[list[str]] = []
+        self._inside: set[str] = set()
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         found = dict(attrs)
+        self._inside.add(tag)
+        if tag == "p":
+            self.paragraphs.append("")
+        elif tag == "tr":
+            self.rows.append([])
+        elif tag == "td":
+            self.rows[-1].append("")
         self.anchors |= {present(found["id"])} if "id" in found else set()
         if tag == "a" and found.get("href"):
             self.links.append(present(found["href"]))
@@ -45,8 +55,15 @@ class Page(HTMLParser):
         elif found.get("src"):
             self.loads.append(present(found["src"]))
 
+    def handle_endtag(self, tag: str) -> None:
+        self._inside.discard(tag)
+
     def handle_data(self, data: str) -> None:
         self.text += data
+        if "p" in self._inside:
+            self.paragraphs[-1] += data
+        if "td" in self._inside:
+            self.rows[-1][-1] += data
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +121,27 @@ def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site: Path, 
     examples = [path for ending in ("py", "yaml") for path in (ROOT / "docs" / "examples").rglob(f"*.{ending}")]
     assert {path.name for path in examples if path.read_text().strip() not in text("examples/index.html")} == set()
     assert not any(mark in path.read_text() for path in pages for mark in ("<!-- table", "<!-- file"))
+
+
+def test_no_list_table_or_code_has_run_into_a_paragraph(site: Path, pages: dict[Path, Page]) -> None:
+    """Python-Markdown wants an empty line before each, and four spaces before what belongs to an item of a list."""
+    begins = re.compile(r"^ *([-*] |\d+\. |\||```)", re.MULTILINE)
+    assert sum(len(page.paragraphs) for page in pages.values()) > 1_000
+    run_in = {
+        f"{path.relative_to(site)}: {text[max(0, found.start() - 60) : found.start() + 20]!r}"
+        for path, page in pages.items()
+        for text in page.paragraphs
+        if (found := begins.search(text)) is not None
+    }
+    assert run_in == set()
+
+
+def test_the_fields_of_a_sweep_file_have_their_values_and_defaults(site: Path, pages: dict[Path, Page]) -> None:
+    rows = [row for row in pages[site / "reference" / "sweep-file.html"].rows if row]
+    fields = {row[0]: row[1:3] for row in rows}
+    assert fields["confirm"][0] == "none or true or false or mapping, below"
+    assert fields["cost"] == ["env_steps or null", "null"]
+    assert fields["source"] == ["text", "empty"]  # of `about`
 
 
 @pytest.mark.browser

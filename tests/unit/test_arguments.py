@@ -1,9 +1,11 @@
 """The Python API answers a wrong argument, whichever it is, by its name and with what it takes."""
 
 import inspect
+import re
 from pathlib import Path
 from typing import Any, cast
 
+import click
 import numpy as np
 import pytest
 from spec_errors import MINIMAL
@@ -11,6 +13,7 @@ from spec_errors import MINIMAL
 import tune_jobs
 from policies.arguments import NumEpisodes, Seed, checked
 from policies.errors import SpecError, TuneJobsError
+from tune_jobs.cli.commands import cli
 
 FUNCTIONS = {name: thing for name in tune_jobs._HOME if inspect.isfunction(thing := getattr(tune_jobs, name))}
 
@@ -144,6 +147,63 @@ def test_what_is_given_wrong_often_is_told_in_words() -> None:
     assert caught.value.hint == f"Give {path} or a mapping or a SweepSpec."
     with pytest.raises(SpecError, match="overrides is 'a=1'"):
         tune_jobs.load_spec(MINIMAL, "a=1")
+
+
+# -- the command line
+
+COMMANDS = {"list_sweeps": "list", "list_presets": "presets"}
+"""Of the functions that are not called as theirs is."""
+
+EVERYWHERE = {"--allow-module": None, "--json": None, "--detach": None, "--env": "env_id", "--out": "output"}
+RENAMED: dict[str, dict[str, str | None]] = {
+    "launch": {"SPEC": "source", "--set": "overrides", "--dry-run": None},
+    "inject": {"VALUES": "point"},
+    "report": {"--output": None},
+    "trials": {"--sort": None, "--top": None},
+    "list_presets": {"NAME": None},
+}
+"""What the option or the argument of a command is called in Python; None: there is none. The page has each."""
+IN_PYTHON_ALONE = {("launch", "rl_module"), ("replicate", "race")}
+
+
+def of_command(name: str) -> set[str]:
+    """The options of a function's command, each by its longest name, and its arguments in capital letters."""
+    found = set()
+    for parameter in cli.commands[COMMANDS.get(name, name)].params:
+        is_argument = isinstance(parameter, click.Argument)
+        found.add(str(parameter.name).upper() if is_argument else max(parameter.opts, key=len))
+    return found
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
+SECTION = PAGE.partition("## Functions\n")[2].partition("\n## ")[0]
+
+
+@pytest.mark.parametrize("name", [name for name in FUNCTIONS if COMMANDS.get(name, name) in cli.commands])
+def test_a_function_takes_what_its_command_does_but_for_what_the_page_says(name: str) -> None:
+    other = EVERYWHERE | RENAMED.get(name, {})
+    options = of_command(name)
+    expected = {other.get(option, option.lstrip("-").replace("-", "_").lower()) for option in options} - {None}
+    expected |= {argument for function, argument in IN_PYTHON_ALONE if function == name}
+    assert set(inspect.signature(FUNCTIONS[name]).parameters) == expected
+    assert RENAMED.get(name, {}).keys() <= options
+    assert f"`{name}`" in SECTION.partition(" are functions named like the commands")[0]
+    code = re.findall(r"`([^`]+)`", SECTION)
+    for option in options & other.keys():
+        assert any(option in text.split() for text in code), option
+        assert other[option] is None or other[option] in code
+
+
+def test_the_page_names_the_functions_that_have_a_command() -> None:
+    listed = re.findall(r"`(\w+)`", SECTION.partition(" are functions named like the commands")[0])
+    assert set(listed) == {name for name in FUNCTIONS if COMMANDS.get(name, name) in cli.commands}
+    assert all(f"`{argument}`" in SECTION for _, argument in IN_PYTHON_ALONE)
+
+
+def test_the_jobs_api_is_for_the_command_line() -> None:
+    assert "`http://...`" in SECTION
+    with pytest.raises(SpecError, match="is not the address of a Ray cluster"):
+        tune_jobs.launch(MINIMAL, address="http://127.0.0.1:1")
 
 
 # -- the decorator

@@ -3,10 +3,12 @@
 import json
 import re
 from collections.abc import Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import get_args
 
 import click
+import httpx2
 import pytest
 from client_fixtures import alone, soon  # noqa: F401 (fixtures)
 from fake_results import COMPARISON, IMPORTANCE
@@ -16,6 +18,7 @@ from sweep_folders import make_sweep_folder
 from test_service_downloads import FILM, PAGE, make_finished
 
 from analysis.records import JobRecord
+from tests.narrowing import present
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.server import THERE
 from tune_jobs.client import Client
@@ -24,6 +27,7 @@ from tune_jobs.store.names import FILMS
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.outcome import Film
 
+GUIDE = (Path(__file__).parents[2] / "docs" / "guides" / "service.md").read_text()
 YAML = "env: CartPole-v1\nalgorithm: ppo\nspace: {lr: {loguniform: [1e-4, 1e-2]}}\nnum_samples: 3\nconfirm: none\n"
 
 
@@ -203,7 +207,7 @@ def test_a_sweep_is_downloaded_as_one_file(run: RunCommand, site: Live, tmp_path
         ("export mine failed --format sweep", "--format sweep"), ("importance a/b", "is no name of a sweep"),
         ("reproduce mine/t0001", "`tune-jobs reproduce`"), ("serve", "`tune-jobs serve`"),
         ("token list", "`tune-jobs token list`"), ("launch none.yaml", "none.yaml"),
-        ("status a/b", "is no name of a sweep"),
+        ("status a/b", "is no name of a sweep"), ("attach mine", "`tune-jobs attach`"),
     ],
 )  # fmt: skip
 def test_what_goes_with_no_service_is_refused(run: RunCommand, site: Live, arguments: str, words: str) -> None:
@@ -217,8 +221,19 @@ def test_all_commands_are_done_there_or_refused_or_about_nothing_there() -> None
     about_neither = {"presets", "hyperparams", "schema"}
     refused = {"attach", "evaluate", "reproduce", "serve", "token"}
     assert {*THERE, *about_neither, *refused} == cli.commands.keys()
+    told = re.search(r"`launch` \(.*? go to the\s+service; (.*?) need none.*? are refused: (.*?)\. ", GUIDE, re.DOTALL)
+    named = [set(re.findall(r"`([a-z]+)\b", words)) for words in present(told).group(0, 1, 2)]
+    assert named == [cli.commands.keys(), about_neither, refused]
     assert "--output" in {name for item in cli.commands["report"].params for name in item.opts}
     assert isinstance(cli, click.Group)
+
+
+def test_the_guides_problem_document_is_the_services_answer(site: Live) -> None:
+    (example,) = re.findall(r"```json\n(\{\"type\": \"about:blank\".*?)```", GUIDE, re.DOTALL)
+    wrong = {"env": "CartPole-v1", "algorithm": "ppo", "space": {"hiden_sizes": {"grid": [[32], [64]]}}}
+    answer = httpx2.post(f"{site.url}/api/v1/plans", json={"spec": wrong}, timeout=30)
+    # Python 3.13 has another phrase for this status.
+    assert answer.json() == json.loads(example) | {"title": HTTPStatus(answer.status_code).phrase}
 
 
 def test_what_is_about_no_sweep_needs_no_service(run: RunCommand) -> None:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,8 @@ from tests.benchmarks.cluster.costs import wait_ms_a_trial
 from tests.benchmarks.cluster.measured import Driven
 from tests.benchmarks.cluster.model import Costs, Load, fitted, limits, predicted_cpu_s, read, table, used
 
-MEASURED = Path(__file__).parents[1] / "benchmarks" / "cluster" / "measured_costs.json"
+ROOT = Path(__file__).parents[2]
+MEASURED = ROOT / "tests" / "benchmarks" / "cluster" / "measured_costs.json"
 COSTS = Costs(sweep_s=2.0, trial_s=0.005, report_s=0.001, gcs_s=0.002, requests=10.0)
 
 
@@ -76,5 +79,12 @@ def test_the_model_has_the_driver_time_of_what_was_measured() -> None:
 
 
 def test_the_guide_has_the_table_of_what_was_measured() -> None:
-    guide = Path(__file__).parents[2] / "docs" / "guides" / "large-clusters.md"
-    assert table(read(MEASURED)) in guide.read_text(encoding="utf-8")
+    guide = ROOT / "docs" / "guides" / "large-clusters.md"
+    # Between empty lines, without which it is no table.
+    assert f"\n\n{table(read(MEASURED))}\n\n" in guide.read_text(encoding="utf-8")
+
+
+def test_the_program_prints_the_table_alone() -> None:
+    command = [sys.executable, "-m", "tests.benchmarks.cluster.model", str(MEASURED)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{table(read(MEASURED))}\n"

@@ -17,10 +17,14 @@ from click.testing import CliRunner
 from pydantic import BaseModel
 
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+from tests.narrowing import present
 from tune_jobs.cli.commands import cli
+from tune_jobs.plan.pack_plan import MAX_AT_ONCE_BY_MODEL
 from tune_jobs.spec.domains import DOMAIN_KINDS
-from tune_jobs.spec.file import json_schema
+from tune_jobs.spec.file import json_schema, list_presets
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.sweeps.exports import _SUFFIXES as SUFFIXES
+from tune_jobs.sweeps.exports import FORMATS
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("policies", "analysis", "tune_jobs")
@@ -205,6 +209,62 @@ def test_every_command_with_its_options_exists() -> None:
             used = set(re.findall(r"(?<!\S)--[a-z-]+", rest))
             wrong |= {f"{place}: {name} {option}" for option in used - options}
     assert wrong == set()
+
+
+def test_every_target_of_make_exists_and_is_given_none_of_a_programs_options() -> None:
+    rules = (ROOT / "Makefile").read_text()
+    targets = set(present(re.search(r"^\.PHONY: (.*)$", rules, re.MULTILINE)).group(1).split())
+    # As code in a line, or at the beginning of a line of a block.
+    pattern = re.compile(r"(?:`|^(?:\$ )?|&& )make ([^`\n#&]+)", re.MULTILINE)
+    pages = [*DOCUMENTS, *(ROOT / name for name in ("CONTRIBUTING.md", "docker/README.md"))]
+    texts = [*TEXTS, *((str(path.relative_to(ROOT)), path.read_text()) for path in pages)]
+    found = {
+        (place, line.strip())
+        for place, text in texts
+        for part in [*(f"`{code}`" for code in quoted(text)), *BLOCK.findall(text)]
+        for line in pattern.findall(part)
+    }
+    assert len(found) > 10
+    # What make itself takes beside targets are values of its variables.
+    wrong = {
+        f"{place}: make {line}"
+        for place, line in found
+        for word in line.split()
+        if word not in targets and not re.fullmatch(r"[A-Z]+=\S+", word)
+    }
+    assert wrong == set()
+
+
+# Pages with what the command prints: a part of it, and the whole of it.
+TUTORIAL = {page: (ROOT / page).read_text() for page in ("README.md", "docs/getting-started.md")}
+
+
+def test_the_tutorials_sweep_is_told_alike_wherever_it_is() -> None:
+    readme, page = (present(re.search(r"```\n(\d+ trials: .*?)```", text, re.DOTALL)) for text in TUTORIAL.values())
+    lines = iter(page.group(1).splitlines())
+    assert [line for line in readme.group(1).splitlines() if line != "..." and line not in lines] == []
+    (times,) = {tuple(re.findall(r"(\d+) s after installation", text)) for text in TUTORIAL.values()}
+    (preset,) = (preset for preset in list_presets() if preset.name == "cartpole-ppo")
+    assert [preset.time] == [f"about {seconds} s on 2 cores" for seconds in times]
+    num_trials, num_env_steps = re.findall(r"[\d,]+", page.group(1).splitlines()[0])[::2]
+    words = r"about ([\d,]+) in (\d+) trials: the (\d+) of the search, and (\d+) with"
+    steps, trials, searched, added = present(re.match(words, preset.env_steps)).groups()
+    assert trials == num_trials == str(int(searched) + int(added))
+    # To three digits.
+    assert int(steps.replace(",", "")) == round(int(num_env_steps.replace(",", "")), -4)
+
+
+def test_how_many_trials_a_model_has_at_once_is_in_the_guide() -> None:
+    guide = (ROOT / "docs" / "guides" / "search.md").read_text()
+    assert f"at most {MAX_AT_ONCE_BY_MODEL} trials run at once" in guide
+    (elsewhere,) = re.findall(r"at\s+most (\d+)\]\(#a-model-of-the-finished-trials\)", guide)
+    assert elsewhere == str(MAX_AT_ONCE_BY_MODEL)
+
+
+def test_what_export_calls_its_files_is_in_the_guide() -> None:
+    guide = (ROOT / "docs" / "guides" / "exports.md").read_text()
+    names = {f"mine{SUFFIXES.get(kind, f'-{kind}/')}" for kind in FORMATS}
+    assert set(re.findall(r"`(mine[-.][a-z]+/?)`", guide.partition("\n\n|")[0])) == names
 
 
 def test_every_key_of_a_sweep_file_that_is_named_is_one() -> None:

@@ -35,7 +35,10 @@ FORMATS = ("csv", "parquet", "latex", "optuna", "pdf", "svg", "png", "sweep")
     "--format", "kind", type=click.Choice(FORMATS), help="What to write.  [default: as PATH's suffix says, else csv]"
 )
 @click.option(
-    "--out", "output", metavar="PATH", help="Folder (csv, parquet) or file.  [default: SWEEP's name, in this folder]"
+    "--out",
+    "output",
+    metavar="PATH",
+    help="Folder (csv, parquet) or file.  [default: SWEEP-csv, SWEEP-parquet, else SWEEP and a suffix, in this folder]",
 )
 @click.option("--top", type=click.IntRange(min=1), metavar="N", help="Settings of the table (10) or the figure (3).")
 @storage_option

@@ -4,7 +4,8 @@ The driver of a sweep is one process, which handles one event after another: a t
 A process that trains waits for the driver after each report, and for its next trial. So the model is a queue with one
 server and as many customers as trials run at once (`used`); `fitted` finds the costs of a trial and of a report by
 least squares. `python -m tests.benchmarks.cluster.model FILE` prints the table of
-docs/guides/large-clusters.md from what `python -m tests.benchmarks --only cluster --save FILE` measured.
+docs/guides/large-clusters.md from what `python -m tests.benchmarks --only cluster --save FILE` measured, and the costs
+on standard error.
 """
 
 from __future__ import annotations
@@ -154,5 +155,5 @@ def read(path: Path) -> Costs:
 
 if __name__ == "__main__":
     measured_costs = read(Path(sys.argv[1]))
-    print(measured_costs)
+    print(measured_costs, file=sys.stderr)
     print(table(measured_costs))
