@@ -276,6 +276,10 @@ class SweepRecord(Record):
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
     prior: tuple[PriorRecord, ...] = Field((), description="What its search began with, of earlier sweeps.")
     env_threshold: float | None = Field(None, description="The env's own threshold when it was planned, if it has one.")
+    is_flattened: bool = Field(
+        default=False,
+        description="Whether the env's own observations were neither vectors nor images; False in older records.",
+    )
 
     @property
     def is_population(self) -> bool:

@@ -40,10 +40,16 @@ class _Code:
 
 
 _NO_CLIPPING = _Code('float("inf")')
+_NO_IMAGES = "The env's own observations are no images, as the convolutions need: wrap it."
 
 
 def stable_baselines3_program(
-    values: TrainedHyperparams, *, env_id: str, env_args: Mapping[str, Any], num_env_steps: int
+    values: TrainedHyperparams,
+    *,
+    env_id: str,
+    env_args: Mapping[str, Any],
+    num_env_steps: int,
+    flattens: bool = False,
 ) -> ForeignProgram:
     """Return a program that trains with a setting in Stable-Baselines3 2.7 or later.
 
@@ -52,6 +58,7 @@ def stable_baselines3_program(
         env_id: A registered Gymnasium id.
         env_args: Keyword arguments of the environment.
         num_env_steps: Env steps to train.
+        flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
     """
     is_ppo = isinstance(values, PPOHyperparams)
     arguments, notes = _sb3_ppo(values) if isinstance(values, PPOHyperparams) else _sb3_dqn(values, num_env_steps)
@@ -73,8 +80,13 @@ def stable_baselines3_program(
     if values.conv_filters is not None:
         notes.append("conv_filters are left out: SB3's are those of CnnPolicy, or of a features extractor of your own.")
     name = "PPO" if is_ppo else "DQN"
-    made = f"make_vec_env({env_id!r}, n_envs={values.num_envs}{_env_kwargs('env_kwargs', env_args)})"
-    imports = ["import torch", f"from stable_baselines3 import {name}"]
+    wrapper, imports = "", ["import torch", f"from stable_baselines3 import {name}"]
+    if flattens and values.conv_filters is None:
+        wrapper = ", wrapper_class=FlattenObservation"
+        imports.insert(0, "from gymnasium.wrappers import FlattenObservation")
+    elif flattens:
+        notes.append(_NO_IMAGES)
+    made = f"make_vec_env({env_id!r}, n_envs={values.num_envs}{wrapper}{_env_kwargs('env_kwargs', env_args)})"
     imports += ["from stable_baselines3.common.env_util import make_vec_env"]
     lines = [f"env = {made}"]
     scales = isinstance(values, PPOHyperparams) and values.normalize_rewards
@@ -95,13 +107,16 @@ def stable_baselines3_program(
     return ForeignProgram("\n".join([*imports, "", *lines]), tuple(notes))
 
 
-def rllib_program(values: TrainedHyperparams, *, env_id: str, env_args: Mapping[str, Any]) -> ForeignProgram:
+def rllib_program(
+    values: TrainedHyperparams, *, env_id: str, env_args: Mapping[str, Any], flattens: bool = False
+) -> ForeignProgram:
     """Return a program that makes RLlib's algorithm (Ray 2.60, new API stack) with a setting.
 
     Args:
         values: The setting, all hyperparameters of it.
         env_id: A registered Gymnasium id.
         env_args: Keyword arguments of the environment.
+        flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
     """
     arguments, notes = _rllib_ppo(values) if isinstance(values, PPOHyperparams) else _rllib_dqn(values)
     name = "PPO" if isinstance(values, PPOHyperparams) else "DQN"
@@ -130,6 +145,17 @@ def rllib_program(values: TrainedHyperparams, *, env_id: str, env_args: Mapping[
     schedule = values.lr if values.lr_final is None else [[0, values.lr], [values.lr_decay_steps, values.lr_final]]
     # RLlib's DQN clips at 40 if it isn't told.
     training = {"lr": schedule, "gamma": values.gamma, "grad_clip": values.grad_clip, **arguments}
+    imports, registered = "", ""
+    if flattens and values.conv_filters is None:
+        # RLlib has no argument for an env's wrapper, and its layers take no whole numbers.
+        imports = (
+            "import gymnasium\nimport numpy\nfrom gymnasium.wrappers import DtypeObservation, FlattenObservation\n"
+            "from ray.tune import register_env\n"
+        )
+        made = f"DtypeObservation(FlattenObservation(gymnasium.make({env_id!r}, **config)), numpy.float32)"
+        registered, env_id = f'register_env("flattened", lambda config: {made})\n\n', "flattened"
+    elif flattens:
+        notes.append(_NO_IMAGES)
     chain = [
         f".environment({env_id!r}{_env_kwargs('env_config', env_args)})",
         _call(".env_runners", [], runners),
@@ -139,9 +165,9 @@ def rllib_program(values: TrainedHyperparams, *, env_id: str, env_args: Mapping[
     ]
     body = "\n".join(f"    {line}" for part in chain for line in part.splitlines())
     code = (
-        f"from ray.rllib.algorithms.{name.lower()} import {name}Config\n"
+        f"{imports}from ray.rllib.algorithms.{name.lower()} import {name}Config\n"
         "from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig\n\n"
-        f"config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
+        f"{registered}config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
     )
     return ForeignProgram(code, tuple(notes))
 

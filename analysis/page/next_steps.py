@@ -134,14 +134,15 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     names = ("frame_stack", "pixels", "atari", "action_mask", "failure_penalty")
     changed = [name for name in names if env.get(name) not in (None, 1, False)]
     note = f" The env's {', '.join(changed)} are left out." if changed else ""
+    flattens = source.sweep.is_flattened
     if spec.get("rl_module"):
         note += " The RLModule of your own is left out."
     for title, program in (
         (
             "The setting in Stable-Baselines3",
-            stable_baselines3_program(values, env_id=env_id, env_args=env_args, num_env_steps=cap),
+            stable_baselines3_program(values, env_id=env_id, env_args=env_args, num_env_steps=cap, flattens=flattens),
         ),
-        ("The setting in RLlib", rllib_program(values, env_id=env_id, env_args=env_args)),
+        ("The setting in RLlib", rllib_program(values, env_id=env_id, env_args=env_args, flattens=flattens)),
     ):
         why = "The same values in its names; scores may differ, as implementations do." + note
         yield Step(title, " ".join([why, *program.notes]), program.code, folded=True)

@@ -13,6 +13,7 @@ by the start of a Discrete space, and for Box actions transformed as the policy 
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from abc import ABC, abstractmethod
@@ -276,7 +277,8 @@ class RandomPolicy(Policy):
 def copy_space(space: gym.Space[Any]) -> ActionSpace:
     """Return a copy of a space, with a random generator of its own."""
     if is_made(space):
-        return type(space)(space.original)
+        # The original draws, too.
+        return type(space)(copy.deepcopy(space.original))
     if isinstance(space, gym.spaces.Box):
         return gym.spaces.Box(space.low, space.high, space.shape, cast("Any", space.dtype))
     if isinstance(space, gym.spaces.Discrete):

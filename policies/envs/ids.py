@@ -60,6 +60,9 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         reasons = "".join(f" {problem}" for problem in problems)
         guess = _nearest_ids(env_id, gym.registry)
         hint = "Correct the id, or install the package that registers it."
+        module, _, name = env_id.rpartition(".")
+        if not guess and module and all(map(str.isidentifier, env_id.split("."))):
+            guess = f" A class of a module is written module:Class: '{module}:{name}'."
         if is_atari_id(env_id) and not any(map(is_atari_id, gym.registry)):
             guess, hint = " It is a game of the Arcade Learning Environment, which is not installed.", INSTALL
         raise EnvError(f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}", hint)

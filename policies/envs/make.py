@@ -28,7 +28,7 @@ from policies.envs.faults import close_env, is_of_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
-from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked
+from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_by_networks
 from policies.envs.own_actions import (
     Choices,
     TakesActions,
@@ -40,6 +40,7 @@ from policies.envs.own_actions import (
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
+from policies.envs.spaces import unwritable_key
 from policies.envs.wrappers import FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
@@ -101,6 +102,8 @@ class EnvInfo:
     """Where its mask of actions comes from, in words; None if it has none, or none that is used."""
     unused_mask: str | None = None
     """The name of an info that looks like a mask of actions, which is not used."""
+    is_flattened: bool = False
+    """Whether its own observations are neither vectors nor images, and were made such (`policies.envs.flat`)."""
 
     @property
     def observes_images(self) -> bool:
@@ -126,7 +129,8 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         kwargs = dict(env_args or {})
         wrappers = ObservationWrappers.take_from(kwargs)
         mask = wrapper_of(env, MasksActions)
-        is_changed = mask or wrapper_of(env, FlatObservations) or wrapper_of(env, TakesActions)
+        is_flattened = bool(wrapper_of(env, FlatObservations) or (mask and isinstance(mask.space.seen, FlatBox)))
+        is_changed = mask or is_flattened or wrapper_of(env, TakesActions)
         info = EnvInfo(
             env_id=env_id,
             env_args=copy.deepcopy(dict(env_args or {})),
@@ -139,9 +143,11 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             and takes_vector_entry_point(spec, kwargs),
             failure=failure_rule(env_id, spec, env.metadata, kwargs),
             mask=None if mask is None else mask.place,
+            is_flattened=is_flattened,
         )
         _check_action_space(info, algorithm)
         _check_observation_space(info)
+        _check_keys(info)
         infos = check_first_step(env, info.env_id, constructor_args(info.env_args))
     finally:
         close_env(env)
@@ -354,6 +360,18 @@ def _check_observation_space(info: EnvInfo) -> None:
     except ValueError as error:
         raise EnvError(f"{info.env_id} cannot be trained on: {error} ({space}).", hint) from error
     raise EnvError(f"{info.env_id} has observations {space}, which were not made vectors.", hint)
+
+
+def _check_keys(info: EnvInfo) -> None:
+    """Refuse members that a policy file could not name."""
+    spaces = (("observations", seen_by_networks(info.observation_space)), ("actions", info.action_space))
+    for what, space in spaces:
+        key = unwritable_key(getattr(space, "original", space))
+        if key is not None:
+            raise EnvError(
+                f"{info.env_id} has {what} with a member {key}, and no file of a policy can name that.",
+                "Name the members of a Dict by texts, by numbers, or by tuples of these.",
+            )
 
 
 def _check_action_space(info: EnvInfo, algorithm: Algorithm | None) -> None:

@@ -91,6 +91,7 @@ class Numbers(gym.spaces.Box):
         if len(boxes) != len(sizes):
             raise UnsupportedActionsError(f"{shortened(original)}, which are not only numbers")
         _check_total(sum(sizes), original)
+        self._has_whole = any(not np.issubdtype(space.dtype, np.floating) for space in self._boxes)
         floats = [space.dtype for space in self._boxes if np.issubdtype(space.dtype, np.floating)]
         dtype = np.result_type(np.float32, *floats)
         with np.errstate(over="ignore"):
@@ -99,6 +100,20 @@ class Numbers(gym.spaces.Box):
                 for side in ("low", "high")
             )
         super().__init__(low, high, dtype=dtype.type)
+
+    @override
+    def seed(self, seed: Any = None) -> Any:
+        """Seed the random numbers, those of the original where it draws."""
+        if self._has_whole:
+            self.original.seed(seed)
+        return super().seed(seed)
+
+    @override
+    def sample(self, mask: None = None, probability: None = None) -> NDArray[Any]:
+        """Draw numbers as the original does where some are whole: rounded ones would be at the bounds half as often."""
+        if self._has_whole:
+            return self.given_for(self.original.sample())
+        return super().sample(mask, probability)
 
     def own(self, numbers: NDArray[Any]) -> Any:
         """Return an action as the environment takes it."""

@@ -10,10 +10,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from policies.envs.flat import MAX_SIZE, FlatBox
+from policies.envs.flat import MAX_SIZE, FlatBox, leaves
 from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices, is_made, made_of
-from policies.errors import MALFORMED, CheckpointError
+from policies.errors import MALFORMED, CheckpointError, shortened
 
 _FLAT = "made_of"
 """In the description of the vectors that observations are made, the space of the observations themselves."""
@@ -158,7 +158,8 @@ def _any_from_description(description: Mapping[str, Any]) -> gym.Space[Any]:
         return gym.spaces.MultiBinary(shape if len(shape) != 1 else shape[0])
     if kind == "dict":
         # As pairs: Gymnasium sorts a dict's keys, and the space that is described may have them in another order.
-        return gym.spaces.Dict([(key, _any_from_description(inner)) for key, inner in description["members"]])
+        members = description["members"]
+        return gym.spaces.Dict([(_key_from_json(key), _any_from_description(inner)) for key, inner in members])
     if kind == "tuple":
         return gym.spaces.Tuple([_any_from_description(inner) for inner in description["members"]])
     if kind == "box":
@@ -166,6 +167,23 @@ def _any_from_description(description: Mapping[str, Any]) -> gym.Space[Any]:
         low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))
         return gym.spaces.Box(low, high, shape, dtype.type)
     raise ValueError(f"no space is of type {str(kind)[:80]!r}")
+
+
+def unwritable_key(space: gym.Space[Any]) -> str | None:
+    """Return how messages show a key of a Dict, also a nested one, that no JSON file can hold; None: it holds all."""
+    for keys, _ in leaves(space, ()):
+        for key in keys:
+            if not _is_writable(key):
+                return shortened(key)
+    return None
+
+
+def _is_writable(key: Any) -> bool:
+    return all(map(_is_writable, key)) if isinstance(key, tuple) else isinstance(key, str | int | float | None)
+
+
+def _key_from_json(key: Any) -> Any:
+    return tuple(map(_key_from_json, key)) if isinstance(key, list) else key
 
 
 def _checked_shape(description: Mapping[str, Any]) -> tuple[int, ...]:

@@ -211,8 +211,11 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
             f"Leave {FRAME_STACK} out, or choose another env.",
         )
     seen = space.seen if isinstance(space, MaskedBox) else space
-    low, high = (np.concatenate([bound] * num_frames, axis=-1) for bound in (seen.low, seen.high))
-    stacked = gym.spaces.Box(low, high, dtype=cast("Any", space.dtype).type)
+    dtype: Any = space.dtype
+    # Bounds beyond what 32 bits hold, which vectors behind a mask are of, are infinite there.
+    with np.errstate(over="ignore"):
+        low, high = (np.concatenate([bound] * num_frames, axis=-1).astype(dtype) for bound in (seen.low, seen.high))
+    stacked = gym.spaces.Box(low, high, dtype=dtype.type)
     return MaskedBox(stacked, space.sizes) if isinstance(space, MaskedBox) else stacked
 
 

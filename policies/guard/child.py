@@ -128,6 +128,7 @@ def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str
         "failure": None if info.failure is None else {"reward": info.failure.reward},
         "mask": info.mask,
         "unused_mask": info.unused_mask,
+        "is_flattened": info.is_flattened,
     }
 
 

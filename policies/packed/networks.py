@@ -22,19 +22,14 @@ from torch import Tensor
 
 from policies.packed.activations import ACTIVATIONS
 from policies.packed.convolutions import Convolution, StackedConvolutions
+from policies.packed.sizes import LINE, NARROW
 
 Floats = NDArray[np.float32]
 
 
-# A cache line. Where matrices do not begin at one, some CPUs multiply them by other kernels, which round otherwise:
-# what a network computes would depend on its place in the stack.
-_LINE = 16
-_NARROW = 16
-"""A layer of fewer inputs or outputs is multiplied by NumPy, see `_is_narrow`; from there on torch is about as fast."""
-
-
 def _whole_lines(num_weights: int) -> int:
-    return math.ceil(num_weights / _LINE) * _LINE
+    """Return how many numbers a block takes, so that the next one begins at a cache line, too."""
+    return math.ceil(num_weights / LINE) * LINE
 
 
 class StackedNetworks:
@@ -173,7 +168,7 @@ def _is_narrow(layer: Tensor) -> bool:
     For two outputs it takes a seventh of the time of torch's MKL on an AMD EPYC (2 x 64 numbers a network, 128 rows, 5
     networks), and each network's product is one of its own, so that it rounds alike wherever that is in the stack.
     """
-    return min(layer.shape[1:]) < _NARROW and layer.device.type == "cpu"
+    return min(layer.shape[1:]) < NARROW and layer.device.type == "cpu"
 
 
 def with_ones(x: Floats) -> Floats:

@@ -160,7 +160,12 @@ def merge_statistics(member: AnyMember, rows: NDArray[Any], scale: float = 1.0) 
 
 
 def mask_outputs(outputs: Floats, observations: NDArray[Any], num_masked: int) -> None:
-    """Write `FORBIDDEN` over outputs, (..., A), where the masks of observations, (..., W), forbid the action."""
+    """Write `FORBIDDEN` over outputs, (..., A), where the masks of observations, (..., W), forbid the action.
+
+    The others are finite afterwards, in place of the NaN and the infinity of a member whose weights are ruined: what is
+    chosen by comparing outputs may be forbidden otherwise.
+    """
+    np.copyto(outputs, np.float32(0.0), where=~np.isfinite(outputs))
     np.copyto(outputs, np.float32(FORBIDDEN), where=observations[..., :num_masked] == 0)
 
 

@@ -89,3 +89,15 @@ def test_soft_target_updates_follow_every_update_and_adam_is_torchs() -> None:
     assert result["learners"]["default_policy"][NUM_TARGET_UPDATES] == num_env_steps * 0.1
     # The note on what is left out says so.
     assert (optimizer.defaults["eps"], optimizer.defaults["betas"]) == (1e-8, (0.9, 0.999))
+
+
+@pytest.mark.parametrize("values", [PPOHyperparams(train_batch_size=64, minibatch_size=32), DQNHyperparams()], ids=type)
+def test_observations_that_are_no_vectors_are_made_some(values: TrainedHyperparams) -> None:
+    names: dict[str, Any] = {}
+    exec(rllib_program(values, env_id="Blackjack-v1", env_args={"sab": True}, flattens=True).code, names)
+    algorithm = names["algorithm"]
+    try:
+        assert algorithm.train()["num_env_steps_sampled_lifetime"] > 0
+        assert algorithm.env_runner.env.single_observation_space.shape == (32 + 11 + 2,)
+    finally:
+        algorithm.stop()

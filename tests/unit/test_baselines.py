@@ -16,6 +16,7 @@ from policies.acting.evaluate import Evaluator, evaluate_policy
 from policies.acting.load import load_policy, policy_from_portable
 from policies.acting.policy import RandomPolicy
 from policies.envs.make import check_env
+from policies.envs.own_actions import Numbers
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import Algorithm, ConstantHyperparams, RandomHyperparams
 from policies.portable.file import PolicyNetwork, PortablePolicy, read_policy, save_policy
@@ -111,6 +112,37 @@ def test_random_play_is_the_random_policy_to_the_last_action() -> None:
     seeds = range(10)
     ours = evaluate_policy(policy_from_portable(portable("CartPole-v1")), env_id="CartPole-v1", seeds=seeds)
     assert ours == evaluate_policy(RandomPolicy.for_env("CartPole-v1"), env_id="CartPole-v1", seeds=seeds)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [gym.spaces.Box(0, 2, (1,), np.int64), gym.spaces.Dict(a=gym.spaces.Box(0, 2, (1,), np.uint8))],
+    ids=["box", "dict"],
+)
+def test_random_play_takes_each_whole_number_as_often(space: gym.Space[Any]) -> None:
+    made = Numbers(space)
+    policy = RandomPolicy(gym.spaces.Box(-1, 1, (1,)), made, env_id="x", seed=3)
+    drawn = [policy.act(np.zeros(1)) for _ in range(3_000)]
+    assert all(action in space for action in drawn)
+    values = [int((action["a"] if isinstance(action, dict) else action)[0]) for action in drawn]
+    # Six standard deviations.
+    assert np.bincount(values, minlength=3) == pytest.approx([1_000] * 3, abs=155)
+    policy.reset(3)
+    assert [policy.act(np.zeros(1)) for _ in range(50)] == drawn[:50]
+    # The space that it was given draws by itself.
+    made.seed(1)
+    wanted = [made.sample().tolist() for _ in range(20)]
+    made.seed(1)
+    assert [(policy.act(np.zeros(1)), made.sample().tolist())[1] for _ in range(20)] == wanted
+
+
+def test_random_numbers_that_need_not_be_whole_are_drawn_as_a_box_draws() -> None:
+    space = gym.spaces.Box(-2, 3, (2, 2), np.float32)
+    made = Numbers(space)
+    for drawing in (made, space):
+        drawing.seed(5)
+    for _ in range(5):
+        np.testing.assert_array_equal(made.sample().reshape(2, 2), space.sample())
 
 
 def test_pushing_left_for_ever_fails_sooner_than_random_play() -> None:

@@ -135,6 +135,30 @@ def test_what_is_neither_vector_nor_image_is_made_a_vector_and_stacked() -> None
     np.testing.assert_array_equal(env.step(0)[0], [*first, *second])
 
 
+def test_vectors_behind_a_mask_are_stacked_whatever_their_bounds() -> None:
+    class Far(Counter):
+        def __init__(self) -> None:
+            super().__init__()
+            self.observation_space = gym.spaces.Box(-1e300, np.array([1e300, 5.0]), (2,), np.float64)
+
+        def action_masks(self) -> list[int]:
+            return [1, self.ticks % 2]
+
+    gym.register("TestFar-v0", cast("Any", Far))
+    try:
+        env = make_env("TestFar-v0", {"frame_stack": 2})
+        space = check_env("TestFar-v0", {"frame_stack": 2}).observation_space
+    finally:
+        del gym.registry["TestFar-v0"]
+    first, _ = env.reset()
+    assert first.tolist() == [1, 0, *first[2:4], *first[2:4]]
+    second = env.step(0)[0]
+    assert second.tolist() == [1, 1, *first[2:4], *second[4:]]
+    assert isinstance(space, gym.spaces.Box)
+    assert space.dtype == np.float32
+    assert space.high.tolist() == [1, 1, np.inf, 5, np.inf, 5]
+
+
 def test_what_no_vector_can_be_made_of_does_not_stack() -> None:
     class Reads(Counter):
         def __init__(self) -> None:

@@ -93,6 +93,21 @@ def test_an_unknown_id_names_the_nearest(env_id: str, nearest: str) -> None:
     assert caught.value.exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("env_id", "meant"),
+    [
+        ("badenvs.Base", "badenvs:Base"), ("a.b.Class", "a.b:Class"),
+        ("my.env-v0", None), ("..Base", None), ("CartPole.v1", None),
+    ],
+)  # fmt: skip
+def test_a_dot_in_the_place_of_the_colon_is_answered(env_id: str, meant: str | None) -> None:
+    with pytest.raises(EnvError, match="is registered with Gymnasium") as caught:
+        check_env(env_id, None, None)
+    told = f"A class of a module is written module:Class: {meant!r}."
+    assert (told in caught.value.message) is (meant is not None)
+    assert "module:Class" not in caught.value.message.replace(told, "")
+
+
 @pytest.mark.parametrize("env_id", ["", "  ", None, 3, "a b c", "Nothing-v", "-v1", "x/y/z-v0"])
 def test_what_is_no_id_is_refused(env_id: int | str | None) -> None:
     with pytest.raises(EnvError):

@@ -235,6 +235,30 @@ def test_members_of_a_dict_keep_the_order_that_the_env_gave_them() -> None:
         assert list(again.own(np.array(action)).values()) == action
 
 
+def test_members_may_be_named_by_tuples_and_numbers(env_of: EnvOf) -> None:
+    named = cast("Callable[[Any], spaces.Dict]", spaces.Dict)
+    inner = named([(("a", (1, None)), spaces.Discrete(2)), (("b", (2, None)), spaces.Discrete(3))])
+    original = named([(1, inner), (2, spaces.Discrete(2))])
+    info = check_env(env_of(original), None)
+    read = space_from_description(json.loads(json.dumps(describe_space(info.observation_space))))
+    assert isinstance(read, FlatBox)
+    assert read.original == original
+    observation = {1: {("a", (1, None)): 1, ("b", (2, None)): 0}, 2: 1}
+    assert read.flat(observation).tolist() == [0, 1, 1, 0, 0, 0, 1]
+    choices = space_from_description(json.loads(json.dumps(describe_space(Choices(original)))))
+    assert isinstance(choices, Choices)
+    assert choices.own(np.array([1, 0, 1])) == observation
+
+
+@pytest.mark.parametrize("key", [b"far", ("a", np.int64(3)), frozenset("a")], ids=str)
+def test_a_member_whose_name_no_file_can_hold_is_refused_in_words_about_the_env(key: Any, env_of: EnvOf) -> None:
+    named: Any = spaces.Dict([("x", spaces.Discrete(2)), ("y", spaces.Dict([(key, spaces.Discrete(2))]))])
+    with pytest.raises(EnvError) as caught:
+        check_env(env_of(named), None)
+    assert caught.value.message.startswith(f"Samples-v0 has observations with a member {key!r}")
+    assert "by texts, by numbers, or by tuples of these" in caught.value.hint
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -1,11 +1,20 @@
 """The written programs for Stable-Baselines3 train as ours do, or a note says in what they don't."""
 
 import math
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
+from gymnasium.spaces import flatten_space
+from report_sources import setting, settings_of, source_of
+from sweep_folders import make_sweep_folder
+from synthetic_sweep import make_sweep
 
+from analysis.page import next_steps
+from policies.envs.make import check_env
 from policies.foreign_code import ForeignProgram, rllib_program, stable_baselines3_program
+from policies.guard import guarded
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.networks.epsilon import EpsilonSchedule
 
@@ -189,3 +198,60 @@ def test_rllibs_target_updates_that_are_not_ours_are_told() -> None:
     assert for_rllib(target_update_freq=1_500, train_freq=1_000).notes == (
         "The target network is updated every 2000 env steps, ours every 1500.",
     )
+
+
+# -- observations
+
+
+@pytest.mark.parametrize(
+    ("env_id", "args", "flattened"),
+    [
+        ("CartPole-v1", {}, False), ("FrozenLake-v1", {}, True), ("Blackjack-v1", {}, True),
+        ("Blackjack-v1", {"frame_stack": 2}, True), ("Taxi-v3", {"action_mask": True}, True),
+    ],
+)  # fmt: skip
+def test_whether_observations_were_made_vectors_is_known(env_id: str, args: dict[str, Any], flattened: bool) -> None:
+    assert check_env(env_id, args).is_flattened is flattened
+    assert guarded.check_env(env_id, args).is_flattened is flattened
+
+
+@pytest.mark.parametrize(
+    "values", [PPOHyperparams(num_envs=2, train_batch_size=32, minibatch_size=16), DQNHyperparams(**SMALL)], ids=type
+)
+@pytest.mark.parametrize("env_id", ["Blackjack-v1", "FrozenLake-v1"])
+def test_sb3_trains_on_observations_that_are_no_vectors(env_id: str, values: TrainedHyperparams) -> None:
+    pytest.importorskip("stable_baselines3")
+    names: dict[str, Any] = {}
+    program = stable_baselines3_program(values, env_id=env_id, env_args={}, num_env_steps=64, flattens=True)
+    exec(program.code, names)
+    assert names["model"].num_timesteps >= 64
+    assert names["model"].observation_space == flatten_space(gym.make(env_id).observation_space)
+
+
+def test_images_that_have_to_be_made_first_are_told() -> None:
+    told = "The env's own observations are no images, as the convolutions need: wrap it."
+    for filters, flattens in ((None, True), (((4, 3, 2),), True), (((4, 3, 2),), False)):
+        values = PPOHyperparams(conv_filters=filters)
+        for program in (
+            stable_baselines3_program(values, env_id="E", env_args={}, num_env_steps=64, flattens=flattens),
+            rllib_program(values, env_id="E", env_args={}, flattens=flattens),
+        ):
+            assert (told in program.notes) is (filters is not None and flattens)
+            assert ("FlattenObservation" in program.code) is (filters is None and flattens)
+
+
+@pytest.mark.parametrize("flattened", [False, True])
+def test_the_programs_of_a_report_take_the_envs_observations(flattened: bool) -> None:
+    made = make_sweep()
+    made.sweep = made.sweep.model_copy(update={"is_flattened": flattened})
+    best = setting(0, [made.trials[0].trial_id], 1)
+    steps = next_steps.section(source_of(made, settings_of(best))).steps
+    programs = [step.text for step in steps if step.title.startswith("The setting in ")]
+    assert len(programs) == 2
+    assert ["FlattenObservation" in program for program in programs] == [flattened] * 2
+
+
+def test_a_sweeps_record_says_whether_observations_are_made_vectors(tmp_path: Path) -> None:
+    for env_id, flattened in (("CartPole-v1", False), ("FrozenLake-v1", True)):
+        store = make_sweep_folder(tmp_path / env_id, env=env_id)
+        assert store.read_record().is_flattened is flattened

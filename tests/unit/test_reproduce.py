@@ -270,7 +270,7 @@ def test_wider_layers_of_its_pack_are_told_as_its_own_may_have_been_padded(tmp_p
 
 
 def test_of_one_size_or_in_stacks_of_their_own_trials_depend_on_no_others(tmp_path: Path, again: Again) -> None:
-    same = packed_sweep(tmp_path / "same", {"hidden_sizes": [[21]], "lr": [1e-3, 1e-2]}, seeds_per_point=2)
+    same = packed_sweep(tmp_path / "same", {"hidden_sizes": [[24]], "lr": [1e-3, 1e-2]}, seeds_per_point=2)
     assert [notes_of(same, trial.trial_id) for trial in same.read_trials()] == [()] * 4
     space: dict[str, list[Any]] = {"hidden_sizes": [[21], [24]], "num_epochs": [3, 4]}
     apart = packed_sweep(tmp_path / "apart", space)
@@ -279,6 +279,22 @@ def test_of_one_size_or_in_stacks_of_their_own_trials_depend_on_no_others(tmp_pa
         told = re.findall("t000[0-9]", "".join(notes_of(apart, trial.trial_id)))
         assert len(told) == (trial.hyperparams["hidden_sizes"] == [21])
         assert all(epochs[name] == epochs[trial.trial_id] for name in told)
+
+
+def test_sizes_by_which_its_place_in_a_pack_rounds_are_told(tmp_path: Path, again: Again) -> None:
+    space: dict[str, list[Any]] = {"hidden_sizes": [[64]], "minibatch_size": [64, 63], "lr": [1e-3, 1e-2]}
+    store = packed_sweep(tmp_path / "mine", space)
+    for trial in store.read_trials():
+        told = " ".join(notes_of(store, trial.trial_id))
+        assert ("by its place among the trials of its pack" in told) is (trial.hyperparams["minibatch_size"] == 63)
+    # Nobody was beside it.
+    alone = packed_sweep(tmp_path / "alone", {"minibatch_size": [64, 63]})
+    assert [notes_of(alone, trial.trial_id) for trial in alone.read_trials()] == [(), ()]
+    # Of 20 actions' outputs torch makes the values, of as many rows as there are envs.
+    values = packed_sweep(tmp_path / "values", {"lr": [1e-3, 1e-2], "num_envs": [4], "hidden_sizes": [[20]]})
+    assert notes_of(values, "t0000") == ()
+    values = packed_sweep(tmp_path / "others", {"lr": [1e-3, 1e-2], "num_envs": [2], "hidden_sizes": [[20]]})
+    assert "by its place" in " ".join(notes_of(values, "t0000"))
 
 
 def test_on_a_gpu_the_number_of_trials_may_matter(tmp_path: Path, again: Again) -> None:

@@ -10,6 +10,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from contextvars import ContextVar
+from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -36,6 +38,8 @@ from tune_jobs.sweeps.outcome import SweepResult
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection
 
+_most_cpus: ContextVar[float | None] = ContextVar("most_cpus", default=None)
+
 
 def write_new(
     store: Sweep, spec: SweepSpec, plan: SweepPlan, address: str | None, state: SweepState = "running"
@@ -60,6 +64,7 @@ def write_new(
             chosen_points=given_points(spec),
             prior=plan.prior,
             env_threshold=plan.env.threshold,
+            is_flattened=plan.env.is_flattened,
         )
     )
 
@@ -110,13 +115,26 @@ def packs_begun_ahead(spec: SweepSpec, here: Machine | None) -> AbstractContextM
     return begun_ahead(wanted=wanted)
 
 
+@contextlib.contextmanager
+def within_cpus(num_cpus: float) -> Iterator[None]:
+    """Let sweeps that are driven on this machine in the block use at most so many of its CPUs; others have the rest."""
+    token = _most_cpus.set(num_cpus)
+    try:
+        yield
+    finally:
+        _most_cpus.reset(token)
+
+
 def machine_here() -> Machine:
     """Return where a sweep without an address runs: the Ray that the user joined in this process, or this machine."""
     if not _is_connected_by_user():
-        return local_machine()
-    from tune_jobs.ray_tune.connected_ray import connected_machine
+        machine = local_machine()
+    else:
+        from tune_jobs.ray_tune.connected_ray import connected_machine
 
-    return connected_machine()
+        machine = connected_machine()
+    most = _most_cpus.get()
+    return machine if most is None or machine.num_cpus <= most else replace(machine, num_cpus=most, nodes=())
 
 
 def address_of_users_ray() -> str | None:

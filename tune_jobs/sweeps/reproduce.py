@@ -21,7 +21,8 @@ from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env, measure_step
 from policies.hyperparams import TrainedHyperparams, make_hyperparams
-from policies.packed.sizes import is_padded_beside
+from policies.packed.sizes import group_key, is_padded_beside, may_round_by_place
+from policies.portable.file import read_policy
 from tune_jobs.plan.engine_choice import PackPlan, pack_key
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import SweepPlan
@@ -228,7 +229,7 @@ def _compared(store: Sweep, again: Sweep, trial: TrialRecord, num_repeatable: in
         num_equal_weights=sum(same),
         num_other_weights=len(same) - sum(same),
         causes=tuple(changed),
-        notes=tuple(_notes(store, trial, repeated, len(recorded) - len(repeatable), is_known="cpu" in known)),
+        notes=tuple(_notes(store, again, trial, repeated, len(recorded) - len(repeatable), is_known="cpu" in known)),
         knows_cpu="cpu" in known,
         folder=folder_at(again.place) if is_kept else None,
     )
@@ -240,7 +241,9 @@ def _weights(store: Sweep, checkpoint: CheckpointRecord) -> str | None:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
-def _notes(store: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out: int, *, is_known: bool) -> list[str]:
+def _notes(
+    store: Sweep, again: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out: int, *, is_known: bool
+) -> list[str]:
     notes = []
     if num_left_out:
         notes.append(
@@ -253,7 +256,7 @@ def _notes(store: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out
         notes.append(f"The trial is {trial.status}: it was repeated as far as it was recorded.")
     if trial.status == "failed" or repeated.status == "failed":
         notes.append(_failures(trial, repeated))
-    if trial.engine == "packed" and (depends := _depends_on_pack(store, trial)):
+    if trial.engine == "packed" and (depends := _depends_on_pack(store, trial, _num_outputs(again, repeated))):
         notes.append(depends)
     if not is_known:
         here = ", ".join(f"{name} {value}" for name, value in repeated.ran_with.items() if name not in versions())
@@ -264,7 +267,15 @@ def _notes(store: Sweep, trial: TrialRecord, repeated: TrialRecord, num_left_out
     return notes
 
 
-def _depends_on_pack(store: Sweep, trial: TrialRecord) -> str:
+def _num_outputs(again: Sweep, repeated: TrialRecord) -> int | None:
+    """Return how many outputs a trial's policy has; None: it has written none."""
+    for checkpoint in repeated.checkpoints:
+        layers = read_policy(again.checkpoint_folder(checkpoint)).network.layers
+        return len(layers[-1].bias)
+    return None
+
+
+def _depends_on_pack(store: Sweep, trial: TrialRecord, num_outputs: int | None) -> str:
     """Say why a trial's sums may have been rounded otherwise in its pack (decision 10); empty: they were not."""
     spec = stored_spec(store.read_record())
     # Of all packed trials: records have the process that each ran in last, which after a resume is another one.
@@ -282,6 +293,12 @@ def _depends_on_pack(store: Sweep, trial: TrialRecord) -> str:
             "It was repeated alone. In its pack its layers may have been padded to the wider ones of "
             f"{', '.join(wider[:_MAX_NAMED])}{more}: then the last bits of its sums depend on those, its random "
             "numbers do not."
+        )
+    has_group = any(group_key(theirs) == group_key(ours) for theirs in beside.values())
+    if has_group and may_round_by_place(ours, num_outputs):
+        return (
+            "It was repeated alone. With its numbers of rows and units, libraries may round the last bits of its sums "
+            "by its place among the trials of its pack; its random numbers do not depend on that."
         )
     if beside and spec.resources.num_gpus:
         return (
