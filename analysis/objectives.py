@@ -17,6 +17,7 @@ import numpy as np
 
 from analysis.records import IterationRecord, Objective, TrialRecord, length_of
 from analysis.statistics import area_under_curve, moderated_means
+from analysis.statistics.estimate import exponent_of
 
 _LEAST_BETWEEN = 1e-3
 _NUM_LAST_EPISODES = 100
@@ -46,7 +47,7 @@ class SettingScores:
     @property
     def mean(self) -> float:
         """Mean over the seeds."""
-        return math.fsum(self.scores) / len(self.scores)
+        return _weighted_mean([(score, 1.0) for score in self.scores])
 
     @property
     def cost(self) -> float:
@@ -294,13 +295,23 @@ def expected_means(settings: Sequence[Sequence[float]]) -> list[float]:
         DerSimonian & Laird 1986, "Meta-Analysis in Clinical Trials", for the variance between settings; Morris 1983,
         "Parametric Empirical Bayes Inference", for the means.
     """
-    plain = [math.fsum(scores) / len(scores) for scores in settings]
+    if not settings:
+        return []
+    # In units of a power of two, by which nothing is rounded, as the squares of large or small scores are lost.
+    exponent = exponent_of([score for scores in settings for score in scores])
+    units = [[math.ldexp(score, -exponent) for score in scores] for scores in settings]
+    plain = [math.fsum(scores) / len(scores) for scores in units]
+    return [math.ldexp(mean, exponent) for mean in _drawn_back(units, plain)]
+
+
+def _drawn_back(settings: Sequence[Sequence[float]], plain: list[float]) -> list[float]:
+    """Return the means of settings, drawn back; scores are at most 1."""
     if len(plain) < 2 or max(map(len, settings)) < 2:
         return plain
     means = np.array(plain)
     try:
         variances = moderated_means(settings).standard_errors ** 2
-    except ValueError:  # so large that their squares are not finite
+    except ValueError:  # not finite
         return plain
     if not variances.all():
         return plain

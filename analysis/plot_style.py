@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import io
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -88,17 +89,22 @@ def escape(text: str) -> str:
     return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
+def has_place(value: Any) -> bool:
+    """Whether a value has a place on an axis of numbers: null, lists and texts have none."""
+    return is_number(value) and math.isfinite(value)
+
+
 def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
     """Return the searched hyperparameters that can be an axis: numbers with at least two values, lr first.
 
-    One that doesn't act in some trials is none, as these would have no place on it.
+    One that doesn't act in some trials is none, nor one that is null or a list in some, as these would have no place on
+    it. Trials whose points are not chosen yet don't count.
     """
+    points = [trial.point for trial in trials if trial.point]
     names = []
     for name in point_names(trials):
-        if any(lacks(trial.point, name) for trial in trials):
-            continue
-        values = {trial.point[name] for trial in trials if is_number(trial.point.get(name))}
-        if len(values) > 1:
+        values = [point.get(name) for point in points]
+        if all(map(has_place, values)) and len(set(values)) > 1:
             names.append(name)
     return sorted(names, key=lambda name: name != "lr")
 

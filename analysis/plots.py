@@ -24,6 +24,7 @@ from analysis.plot_style import (
     goal_line,
     group_names,
     group_styles,
+    has_place,
     new_figure,
     numeric_names,
     steps_axis,
@@ -111,7 +112,8 @@ def score_by_lr(
 ) -> Figure:
     """Plot the score of each trial against its learning rate, coloured by the hyperparameters with few values.
 
-    Trials that cannot win are grey crosses on the lower edge, because they are part of the result.
+    Trials that cannot win are grey crosses on the lower edge, because they are part of the result. Those whose value is
+    no number, such as null, are left out.
 
     Args:
         trials: The trials of one sweep.
@@ -130,7 +132,8 @@ def score_by_lr(
     positions = _positions(trials, name, styles)
     for label in dict.fromkeys(style.label for style in styles.values()):
         members = [trial for trial in trials if styles[trial.trial_id].label == label]
-        scored = [(positions[t.trial_id], s.score) for t in members if (s := score_trial(t)) is not None]
+        placed = [trial for trial in members if trial.trial_id in positions]
+        scored = [(positions[t.trial_id], s.score) for t in placed if (s := score_trial(t)) is not None]
         if scored:
             style = styles[members[0].trial_id]
             x, y = zip(*scored, strict=True)
@@ -281,9 +284,12 @@ def _draw_winner(
 
 
 def _positions(trials: Sequence[TrialRecord], name: str | None, styles: Mapping[str, Style]) -> dict[str, float]:
-    """Return each trial's position on the horizontal axis: its value, or the number of its group."""
+    """Return each trial's position on the horizontal axis: its value, or the number of its group.
+
+    A trial whose value is no finite number has none.
+    """
     if name is not None:
-        return {trial.trial_id: float(trial.point[name]) for trial in trials if trial.point.get(name) is not None}
+        return {trial.trial_id: float(trial.point[name]) for trial in trials if has_place(trial.point.get(name))}
     labels = list(dict.fromkeys(style.label for style in styles.values()))
     positions = {}
     for i, label in enumerate(labels):

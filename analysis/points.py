@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from analysis.wording import PLAIN_NONE, setting_text, short_text
+from analysis.wording import PLAIN_NONE, is_number, setting_text, short_text
 
 
 class Idle:
@@ -53,6 +54,21 @@ def value_text(
         none: The text of a value that is not known yet.
     """
     return text(point[name]) if name in point else EMPTY if lacks(point, name) else none
+
+
+def meaning_of(point: Mapping[str, Any]) -> str:
+    """Return a text that is equal for points of equal values, however these are written.
+
+    As in sweep files, 2e3 is 2000 and [64] is 64, but true is not 1.
+    """
+    return json.dumps({name: _in_one_form(value) for name, value in point.items()}, sort_keys=True, default=str)
+
+
+def _in_one_form(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        items = list(map(_in_one_form, value))
+        return items[0] if len(items) == 1 and is_number(items[0]) else items
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def setting_labels(points: Sequence[Mapping[str, Any]]) -> list[str]:

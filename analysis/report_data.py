@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from analysis.best_records import BestRecord
 from analysis.records import SweepRecord, finite_or_none
 from policies.portable.file import BASELINE_KINDS
+
+_ATARI_FRAMES = ("frame_skip", "noop_max")
 
 
 def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
@@ -35,6 +38,18 @@ def env_of(sweep: SweepRecord) -> str:
     """Return the env id of a sweep, from its resolved spec."""
     env = sweep.spec.get("env")
     return str(env.get("id", "?")) if isinstance(env, Mapping) else str(env)
+
+
+def env_arguments_of(sweep: SweepRecord) -> dict[str, Any]:
+    """Return what a sweep gives its environment that may change returns.
+
+    That are its arguments and, of an Atari game, how many frames an action lasts and how many no-ops begin a game. What
+    is made of observations doesn't change returns, nor what training alone sees.
+    """
+    env = sweep.section("env")
+    atari = env.get("atari")
+    frames = {f"atari.{name}": atari.get(name) for name in _ATARI_FRAMES} if isinstance(atari, Mapping) else {}
+    return {**(env.get("args") or {}), **frames}
 
 
 def algorithm_of(sweep: SweepRecord) -> str:

@@ -7,12 +7,11 @@ import json
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from analysis.comparison.entries import Entry, Wanted, judged_alike, make_entry
 from analysis.comparison.pairs import Pair, make_pair
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
-from analysis.report_data import env_of
+from analysis.report_data import env_arguments_of, env_of
 from analysis.wording import counted
 
 MAX_ENTRIES = len(string.ascii_uppercase)
@@ -44,31 +43,33 @@ def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Com
     """
     notes: list[str] = []
     thresholds = {item.data.threshold for item in wanted}
-    threshold = thresholds.pop() if len(thresholds) == 1 else None
-    if thresholds:
+    shares_threshold = len(thresholds) < 2
+    threshold = next(iter(thresholds), None) if shares_threshold else None
+    if not shares_threshold:
         notes.append("They have other thresholds, so it is not said how many seeds solved the environment.")
-    chosen = objective or _objective(wanted, threshold, notes)
+    chosen, why = (objective, "") if objective else common_objective(wanted)
+    notes += [why] if why else []
     ready = {
         letter: judged_alike(item, chosen, threshold)
         for letter, item in zip(string.ascii_uppercase, wanted, strict=False)
     }
-    entries = tuple(make_entry(item, letter) for letter, item in ready.items())
+    entries = tuple(make_entry(item, letter, shares_threshold=shares_threshold) for letter, item in ready.items())
     reasons = why_not_comparable([item.sweep for item in wanted], [entry.letter for entry in entries])
     pairs = () if reasons else tuple(make_pair(one, other, ready) for one, other in _pairs(entries))
     notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries)]
     return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes))
 
 
-def _objective(wanted: Sequence[Wanted], threshold: float | None, notes: list[str]) -> Objective:
+def common_objective(wanted: Sequence[Wanted]) -> tuple[Objective, str]:
+    """Return what sweeps or settings are judged by where nobody asked for it, and why, if it isn't what they say."""
     objectives = list(dict.fromkeys(item.data.objective for item in wanted))
     if len(objectives) > 1:
         named = ", ".join(f"{item.name} by {item.data.objective}" for item in wanted)
-        notes.append(f"Their sweep files judge them differently ({named}): here all are judged by final.")
-        return "final"
-    if objectives[0] == "steps_to_threshold" and threshold is None:
-        notes.append("They share no threshold, so they are judged by final, not by the env steps to it.")
-        return "final"
-    return objectives[0]
+        return "final", f"Their sweep files judge them differently ({named}): here all are judged by final."
+    thresholds = {item.data.threshold for item in wanted}
+    if objectives[0] == "steps_to_threshold" and (len(thresholds) > 1 or None in thresholds):
+        return "final", "They share no threshold, so they are judged by final, not by the env steps to it."
+    return objectives[0], ""
 
 
 def _pairs(entries: Sequence[Entry]) -> list[tuple[Entry, Entry]]:
@@ -85,7 +86,7 @@ def why_not_comparable(sweeps: Sequence[SweepRecord], names: Sequence[str]) -> l
         sweeps: At least one.
         names: What each is called in the sentences.
     """
-    first, env_id, arguments = names[0], env_of(sweeps[0]), _arguments_of(sweeps[0])
+    first, env_id, arguments = names[0], env_of(sweeps[0]), env_arguments_of(sweeps[0])
     reasons = []
     for sweep, name in zip(sweeps[1:], names[1:], strict=True):
         if env_of(sweep) != env_id:
@@ -93,17 +94,12 @@ def why_not_comparable(sweeps: Sequence[SweepRecord], names: Sequence[str]) -> l
                 f"{first} is on {env_id}, {name} on {env_of(sweep)}: returns of different environments are on "
                 "different scales."
             )
-        elif _arguments_of(sweep) != arguments:
+        elif (other := env_arguments_of(sweep)) != arguments:
             reasons.append(
-                f"{first} and {name} give {env_id} different arguments ({arguments} and {_arguments_of(sweep)}), "
-                "which may change its returns."
+                f"{first} and {name} give {env_id} different arguments ({arguments} and {other}), which may change its "
+                "returns."
             )
     return reasons
-
-
-def _arguments_of(sweep: SweepRecord) -> dict[str, Any]:
-    """Return the arguments of an environment; what is made of its observations doesn't change returns."""
-    return dict(sweep.section("env").get("args") or {})
 
 
 def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:

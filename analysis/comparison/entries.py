@@ -76,6 +76,8 @@ class Entry:
     """Seconds that the sweep ran; None of a setting."""
     why_none: str = ""
     """Why there are no scores; empty if there are."""
+    sweep_df: float | None = None
+    """Degrees of freedom that the seeds of all settings of the sweep have together; None: as `df`."""
 
 
 def judged_alike(wanted: Wanted, objective: Objective, threshold: float | None) -> Wanted:
@@ -83,17 +85,18 @@ def judged_alike(wanted: Wanted, objective: Objective, threshold: float | None) 
     return replace(wanted, data=replace(wanted.data, objective=objective, threshold=threshold))
 
 
-def make_entry(wanted: Wanted, letter: str) -> Entry:
+def make_entry(wanted: Wanted, letter: str, *, shares_threshold: bool = True) -> Entry:
     """Return the scores and the cost of a sweep or a setting.
 
     Args:
         wanted: What it is of; its `data` says what it is judged by, and which return solves the env.
         letter: What it is called.
+        shares_threshold: False: its `data` has no threshold because those that it is compared with have another one.
     """
     data, threshold = wanted.data, wanted.data.threshold
     ranking = ranked_settings(data)
     chosen = _chosen(wanted, ranking)
-    mine = [trial for trial in data.trials if wanted.point_index in (None, trial.point_index)]
+    mine = _trials_of(wanted)
     costs = core_seconds(data.trials, wanted.cores)
     known = [costs[trial.trial_id] for trial in mine if trial.trial_id in costs]
     entry = Entry(
@@ -125,11 +128,15 @@ def make_entry(wanted: Wanted, letter: str) -> Entry:
         num_env_steps=sum(trial.num_env_steps for trial in mine),
         core_seconds=math.fsum(known) if known else None,
         wall_s=wanted.sweep.run_time_s if wanted.point_index is None else None,
-        why_none="" if chosen is not None else _why_none(wanted, mine),
+        why_none="" if chosen is not None else why_no_scores(wanted, shares_threshold=shares_threshold),
     )
     if chosen is None:
         return entry
     return replace(entry, **_scored(chosen, ranking), **_median(chosen, data))
+
+
+def _trials_of(wanted: Wanted) -> list[TrialRecord]:
+    return [trial for trial in wanted.data.trials if wanted.point_index in (None, trial.point_index)]
 
 
 def _chosen(wanted: Wanted, ranking: Sequence[SettingScores]) -> SettingScores | None:
@@ -138,12 +145,14 @@ def _chosen(wanted: Wanted, ranking: Sequence[SettingScores]) -> SettingScores |
     return next((item for item in ranking if item.point_index == wanted.point_index), None)
 
 
-def _why_none(wanted: Wanted, mine: Sequence[TrialRecord]) -> str:
-    """Return why a sweep or a setting has no scores."""
+def why_no_scores(wanted: Wanted, *, shares_threshold: bool = True) -> str:
+    """Return why a sweep or a setting has no scores; the arguments are those of `make_entry`."""
+    mine = _trials_of(wanted)
     if not wanted.data.has_settings:
-        return "a population, whose trials change their values while they train: none has a setting"
+        return "it is a population, whose trials change their values while they train: none has a setting"
     if wanted.data.objective == "steps_to_threshold" and wanted.data.threshold is None:
-        return "it is judged by the env steps to a threshold, and its environment has none"
+        why = "neither its sweep file nor its environment has one" if shares_threshold else "they share none"
+        return f"it is judged by the env steps to a threshold, and {why}"
     if not mine:
         return "it has no trials yet"
     failed = [trial for trial in mine if trial.status == "failed"]
@@ -172,6 +181,7 @@ def _scored(chosen: SettingScores, ranking: Sequence[SettingScores]) -> dict[str
         "upper": interval.upper,
         "standard_error": float(fit.standard_errors[index]),
         "df": float(fit.dfs[index]),
+        "sweep_df": float(fit.num_seeds.sum() - fit.num_seeds.size),
     }
 
 

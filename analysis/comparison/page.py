@@ -44,8 +44,9 @@ _PROFILE = (
     "its seeds. Bands, of up to three: pointwise 95 % intervals (Wilson)."
 )
 _CURVES = (
-    "Mean greedy evaluation over training seeds; a seed that ended early is held at its last value. Bands, of up "
-    "to three: 95 % intervals over seeds, within what any seed had."
+    "Mean greedy evaluation over training seeds; a seed that ended early is held at its last value, and one that "
+    "failed before its first evaluation is left out. Bands, of up to three: 95 % intervals over seeds, within what any "
+    "seed had."
 )
 
 Size = tuple[float, float]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from analysis.comparison.entries import Entry, Wanted
 from analysis.exports.frames import ranked_settings
 from analysis.objectives import SettingScores
+from analysis.points import meaning_of
 from analysis.statistics import Estimate, iqm, iqm_with_ci, probability_of_improvement, t_quantile
 from analysis.wording import counted
 from policies import random_streams
@@ -17,7 +18,7 @@ from policies import random_streams
 
 @dataclass(frozen=True)
 class Shared:
-    """The settings that two sweeps have in common, each a stratum."""
+    """The settings that two sweeps have in common, each a stratum; points of a sweep with equal values are one."""
 
     num_settings: int
     probability: Estimate
@@ -64,8 +65,12 @@ def make_pair(left: Entry, right: Entry, wanted: Mapping[str, Wanted], *, level:
         wanted: What they were made of, by letter.
         level: That of all intervals.
     """
+    ours, theirs = wanted[left.letter].sweep, wanted[right.letter].sweep
+    of_one_sweep = (ours.name, ours.created_at) == (theirs.name, theirs.created_at)
+    if why := _why_the_same(left, right) if of_one_sweep else "":
+        return Pair(left.letter, right.letter, None, why, None, why, None, "")
     probability, why_no_probability = _probability(left, right, level)
-    difference, why_no_difference = mean_difference(left, right, level)
+    difference, why_no_difference = mean_difference(left, right, level, of_one_sweep=of_one_sweep)
     shared, why_none_shared = None, ""
     if left.is_sweep and right.is_sweep:
         shared, why_none_shared = _shared(wanted[left.letter], wanted[right.letter], level)
@@ -73,6 +78,14 @@ def make_pair(left: Entry, right: Entry, wanted: Mapping[str, Wanted], *, level:
         left.letter, right.letter, probability, why_no_probability, difference, why_no_difference, shared,
         why_none_shared,
     )  # fmt: skip
+
+
+def _why_the_same(left: Entry, right: Entry) -> str:
+    """Return why two entries of a sweep are the same trainings; empty if they aren't."""
+    if not left.trial_ids or left.trial_ids != right.trial_ids:
+        return ""
+    sweep, setting = (left, right) if left.is_sweep else (right, left)
+    return f"{sweep.letter} is compared by its leading setting, and that is {setting.letter}"
 
 
 def _without_scores(left: Entry, right: Entry) -> str:
@@ -89,11 +102,23 @@ def _probability(left: Entry, right: Entry, level: float) -> tuple[Estimate | No
     return probability_of_improvement([left.scores], [right.scores], level=level), ""
 
 
-def mean_difference(left: Entry, right: Entry, level: float = 0.95) -> tuple[Estimate | None, str]:
+def mean_difference(
+    left: Entry, right: Entry, level: float = 0.95, *, of_one_sweep: bool = False
+) -> tuple[Estimate | None, str]:
     """Return the difference of two means over training seeds with its interval, or why there is none.
 
     The errors of the means are moderated over the settings of each sweep, as in `statistics.seed_intervals`, and the
     degrees of freedom are those of Welch and Satterthwaite. Of two sweeps with one setting each it is Welch's interval.
+
+    The errors of two settings of one sweep are learnt from the same seeds, where Welch and Satterthwaite take them for
+    independent: there are no more degrees of freedom than all its seeds have together. Of a sweep whose settings have
+    one common variance it is Student's interval by that variance.
+
+    Args:
+        left: One of them.
+        right: The other.
+        level: The level of the interval.
+        of_one_sweep: Whether both are settings of one sweep.
 
     Source:
         Welch 1947, "The Generalization of Student's Problem when Several Different Population Variances are Involved";
@@ -119,13 +144,15 @@ def mean_difference(left: Entry, right: Entry, level: float = 0.95) -> tuple[Est
     if total == 0.0:
         return None, "no two seeds of either differ, so nothing is known of how much they may"
     df = total**2 / sum(square**2 / df for square, df in errors)
+    if of_one_sweep and left.sweep_df is not None:
+        df = min(df, left.sweep_df)
     half = t_quantile((1.0 + level) / 2.0, max(1.0, df)) * math.sqrt(total)
     return Estimate(gap, gap - half, gap + half, num_seeds), ""
 
 
 def _shared(left: Wanted, right: Wanted, level: float) -> tuple[Shared | None, str]:
     """Compare two sweeps within the settings that both have trained, or say why that can't be done."""
-    ours, theirs = ({_key(item): item for item in ranked_settings(each.data)} for each in (left, right))
+    ours, theirs = (_by_meaning(ranked_settings(each.data)) for each in (left, right))
     common = [key for key in ours if key in theirs]
     if not ours or not theirs:
         return None, ""
@@ -134,7 +161,7 @@ def _shared(left: Wanted, right: Wanted, level: float) -> tuple[Shared | None, s
             f"none of the {counted(len(ours), 'setting')} of {left.name} is among the "
             f"{counted(len(theirs), 'setting')} of {right.name}, so only the leading ones are compared"
         )
-    left_scores, right_scores = [ours[key].scores for key in common], [theirs[key].scores for key in common]
+    left_scores, right_scores = [ours[key] for key in common], [theirs[key] for key in common]
     return Shared(
         num_settings=len(common),
         probability=probability_of_improvement(left_scores, right_scores, level=level),
@@ -150,6 +177,9 @@ def _iqm(tasks: list[tuple[float, ...]], level: float) -> Estimate:
     return Estimate(iqm(scores), math.nan, math.nan, len(scores), "one seed a setting: no interval")
 
 
-def _key(item: SettingScores) -> str:
-    """Return a setting as text; values of other types differ, though 1 == True in Python."""
-    return json.dumps(item.point, sort_keys=True, default=str)
+def _by_meaning(settings: Sequence[SettingScores]) -> dict[str, tuple[float, ...]]:
+    """Return the scores of all seeds of each setting; several points may have equal values, or write them otherwise."""
+    scores: defaultdict[str, tuple[float, ...]] = defaultdict(tuple)
+    for item in settings:
+        scores[meaning_of(item.point)] += item.scores
+    return dict(scores)

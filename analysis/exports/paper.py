@@ -42,6 +42,9 @@ class Curve:
 
     label: str
     num_seeds: int
+    """Those that it is of."""
+    num_without: int
+    """Seeds that showed no such return, as those that failed before their first evaluation; it is not of them."""
     num_env_steps: NDArray[np.float64]
     """Shape (T,)."""
     mean: NDArray[np.float64]
@@ -61,7 +64,8 @@ def setting_curves(data: SweepData, *, top: int, returns: Returns = "evaluation"
     """Return the learning curves of the leading settings of a sweep, best first.
 
     Returns are interpolated between those that are known. A seed that ended before others of the figure, because it
-    reached its goal or failed, is held at its last value: to leave it out would make the mean that of the others.
+    reached its goal or failed, is held at its last value: to leave it out would make the mean that of the others. One
+    that showed no such return has no value to be held at; the curve is that of the others, and counts those it lacks.
     The intervals are `statistics.seed_intervals` over all settings shown, at each number of env steps by itself.
 
     Args:
@@ -91,6 +95,7 @@ def curves_of(data: SweepData, settings: Sequence[SettingScores], *, returns: Re
         Curve(
             label=label,
             num_seeds=len(seeds),
+            num_without=len(item.trial_ids) - len(seeds),
             num_env_steps=grid,
             mean=own.mean(axis=0),
             lower=None if band is None else band[0],
@@ -99,7 +104,7 @@ def curves_of(data: SweepData, settings: Sequence[SettingScores], *, returns: Re
             most=float(own.max()),
             first_end=min(steps[-1] for steps, _ in seeds),
         )
-        for label, (_, seeds), own, band in zip(labels, known, values, bands, strict=True)
+        for label, (item, seeds), own, band in zip(labels, known, values, bands, strict=True)
     ]
 
 
@@ -113,7 +118,8 @@ def learning_figure(
     """Draw the learning curves of the leading settings of one sweep or several, with bands over training seeds.
 
     A curve is the mean over the seeds of a setting, its band the 95 % interval of that mean; with one seed a setting
-    there is no band. Curves are dashed from where the first of their seeds has ended.
+    there is no band. Curves are dashed from where the first of their seeds has ended. The legend says of how many seeds
+    a curve is, and of how many it should be.
 
     Args:
         sweeps: Name and data of each sweep; the name is part of labels if there are several.
@@ -157,7 +163,8 @@ def _draw_curve(axes: Axes, curve: Curve, label: str, color: str) -> None:
     """Draw a curve with its band and, in the legend, its number of seeds."""
     steps, mean = curve.num_env_steps, drawable(curve.mean)
     whole = steps <= curve.first_end
-    seeds = counted(curve.num_seeds, "seed")
+    seeds = counted(curve.num_seeds + curve.num_without, "seed")
+    seeds = f"{curve.num_seeds:,} of {seeds}" if curve.num_without else seeds
     told = f"{label} ({seeds})" if label else seeds
     # A line of one place can't be seen.
     marker = "o" if steps.size == 1 else ""

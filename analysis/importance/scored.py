@@ -1,9 +1,8 @@
 """The score of each point of a sweep, all judged after the same training.
 
-The seeds of a point are one cluster: a point counts once, with its mean. A trial that failed, or showed nothing that
-can be scored, has the worst score of all. Where a scheduler ended trials early, all are judged at the env steps of the
-first one that it ended: the trials that it let go on are a choice of the better ones, in which what makes trials bad
-would not be seen.
+The seeds of a point are one cluster: a point counts once, with its mean. A trial that failed, or never showed anything
+that can be scored, has the worst score of all. Where a scheduler ended trials early, all are judged at the env steps of
+the first one that it ended (`analysis.importance.cut_short`).
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from analysis.importance.cut_short import is_evaluated, notes_of_cut, rows_until, training_alone
 from analysis.objectives import score_of
 from analysis.records import FINISHED, IterationRecord, Objective, SweepRecord, TrialRecord, finite_or_none
 from analysis.wording import counted
@@ -24,6 +24,7 @@ class Scored:
     """The points of a sweep that have a score."""
 
     objective: Objective
+    """What scores are of: the sweep's, or `final` where trials can be judged by training episodes alone."""
     points: tuple[dict[str, Any], ...]
     scores: tuple[float, ...]
     """Mean over the seeds of each point, higher is better."""
@@ -52,49 +53,58 @@ def score_points(
         return Scored(objective, (), (), 0, why_none)
     first_cut = min((trial.num_env_steps for trial in ended if trial.status == "stopped"), default=None)
     whole = int(sweep.section("stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
-
-    def shown(trial: TrialRecord) -> float | None:
-        """Return what a trial scored at the env steps that all are judged at; None: it failed, or showed nothing."""
-        if trial.status == "failed":
-            return None
-        rows = results.get(trial.trial_id, ())
-        if first_cut is not None:
-            rows = [row for row in rows if row.num_env_steps <= first_cut]
-        return finite_or_none(score_of(trial, rows, objective, num_env_steps=first_cut or whole, threshold=goal))
-
-    found = [shown(trial) for trial in ended]
-    known = [score for score in found if score is not None]
+    shown = {trial.trial_id: results.get(trial.trial_id, ()) for trial in ended if trial.status != "failed"}
+    ever: set[str] = set()
+    num_unevaluated = 0
+    if first_cut is not None:
+        ever = {trial_id for trial_id, rows in shown.items() if is_evaluated(rows)}
+        shown = {trial_id: rows_until(rows, first_cut) for trial_id, rows in shown.items()}
+        num_unevaluated = sum(not is_evaluated(shown[trial_id]) for trial_id in ever)
+        if num_unevaluated:
+            objective = "final"
+            shown = {trial_id: training_alone(rows, first_cut // 2) for trial_id, rows in shown.items()}
+    found = {
+        trial.trial_id: finite_or_none(
+            score_of(trial, shown[trial.trial_id], objective, num_env_steps=first_cut or whole, threshold=goal)
+        )
+        for trial in ended
+        if trial.trial_id in shown
+    }
+    # They showed something, but later.
+    left_out = {trial_id for trial_id in ever if found[trial_id] is None}
+    known = [score for score in found.values() if score is not None]
     if not known:
-        return Scored(objective, (), (), 0, "No trial showed a score.")
+        by_then = "" if first_cut is None else f" by {first_cut:,} env steps, where the scheduler ended the first"
+        return Scored(objective, (), (), 0, f"No trial showed a score{by_then}.")
     worst = min(known)
     seeds: defaultdict[int, list[float]] = defaultdict(list)
     values: dict[int, dict[str, Any]] = {}
-    for trial, score in zip(ended, found, strict=True):
-        seeds[trial.point_index].append(worst if score is None else score)
-        values[trial.point_index] = trial.point
+    for trial in ended:
+        if trial.trial_id not in left_out:
+            score = found.get(trial.trial_id)
+            seeds[trial.point_index].append(worst if score is None else score)
+            values[trial.point_index] = trial.point
+    notes = list(_notes_of_worst(num_failed=len(ended) - len(shown), num_lost=len(found) - len(known) - len(left_out)))
+    if first_cut is not None:
+        notes += notes_of_cut(ended, first_cut, num_unevaluated=num_unevaluated, num_left_out=len(left_out))
+    if len(ended) < len(trials):
+        notes.append(f"Left out, as they have not ended: {counted(len(trials) - len(ended), 'trial')}.")
     return Scored(
         objective,
         tuple(values.values()),
         # Divided first, as the sum of scores that are nearly too large for a float is too large.
         tuple(math.fsum(score / len(scores) for score in scores) for scores in seeds.values()),
-        len(ended),
-        notes=tuple(_notes(ended, first_cut, num_lost=len(ended) - len(known), num_waiting=len(trials) - len(ended))),
+        len(ended) - len(left_out),
+        notes=tuple(notes),
         num_env_steps=first_cut,
     )
 
 
-def _notes(ended: Sequence[TrialRecord], first_cut: int | None, *, num_lost: int, num_waiting: int) -> Iterator[str]:
-    """Say what the scores are not; `first_cut` is the env step at which a scheduler ended the first trial, if any."""
+def _notes_of_worst(*, num_failed: int, num_lost: int) -> Iterator[str]:
+    if num_failed:
+        yield f"{counted(num_failed, 'trial')} counted as the worst, having failed."
     if num_lost:
-        yield f"{counted(num_lost, 'trial')} without a score counted as the worst, having failed or ended no episode."
-    if first_cut is not None:
-        num_cut = sum(trial.status == "stopped" for trial in ended)
-        yield (
-            f"The scheduler ended {num_cut:,} of {counted(len(ended), 'trial')} early. All are judged at {first_cut:,} "
-            "env steps, which each of them has done, so this is about the beginning of training."
-        )
-    if num_waiting:
-        yield f"Left out, as they have not ended: {counted(num_waiting, 'trial')}."
+        yield f"{counted(num_lost, 'trial')} counted as the worst, without a finite return to be judged by."
 
 
 def _why_none(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,7 @@ from analysis.statistics import mean_with_ci, paired_difference
 from analysis.wording import counted, return_text, shown_path
 from policies import random_streams
 from policies.acting.movies import still_of
+from policies.envs.masks import ACTION_MASK, METHOD
 from policies.errors import CheckpointError, NotFoundError
 from policies.portable.file import read_policy
 
@@ -159,13 +161,22 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
 def acting_code(folder: Path) -> str:
     """Return how the policy in a folder acts, as Python: with a mask beside the observation if it takes one so."""
     try:
-        needs_mask = read_policy(folder).needs_mask
+        policy = read_policy(folder)
     except (CheckpointError, NotFoundError):
         # It is in an object store, or not written yet.
-        needs_mask = False
-    if needs_mask:
-        return 'action = policy.act(observation, mask=info["action_mask"])  # or where the environment has its mask'
-    return "action = policy.act(observation)"
+        return "action = policy.act(observation)"
+    if not policy.needs_mask:
+        return "action = policy.act(observation)"
+    # As `policies.envs.masks` finds it: a mask that was not asked for is a method's, and a method goes before an info.
+    setting = policy.env_args.get(ACTION_MASK)
+    if setting is None:
+        return f"action = policy.act(observation, mask={_called(METHOD)})"
+    name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
+    return f"action = policy.act(observation, mask=info[{json.dumps(name)}])  # or {_called(method)}, if there is one"
+
+
+def _called(method: str) -> str:
+    return f"env.get_wrapper_attr({json.dumps(method)})()"
 
 
 def setting_card(source: Source) -> SettingCard | None:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.page.scores import counts_env_steps, interval_of, score_means, score_text
-from analysis.page.source import Source
+from analysis.page.source import Source, point_text
 from analysis.points import searched_names, setting_labels, value_text
 from analysis.records import IterationRecord, TrialRecord, finite_or_none
 from analysis.report_tables import Cell, Table, steps_table
 from analysis.statistics import tie_groups
 from analysis.strip_plot import Strip
-from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, point_names, steps_to_solve_frame
+from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, steps_to_solve_frame
 from analysis.wording import NONE, number
 from policies import random_streams
 
@@ -163,7 +163,8 @@ def fewest_env_steps(
         return f"No trial reached {over}."
     # By columns: a row of them would have one type for all its numbers, and with it another word for "missing".
     first = {column: solving[column].iloc[0] for column in solving.columns}
-    values = ", ".join(f"{name} {number(first[name])}" for name in point_names(trials))
+    # The row has a cell for each hyperparameter that any trial has; what acts in this point is known by its trials.
+    values = point_text(next(trial.point for trial in trials if trial.point_index == first["point_index"]))
     who = f"{values} reaches" if values else "The sweep's one point reaches"
     median, num_seeds = finite_or_none(float(first["median_num_env_steps"])), int(first["num_seeds"])
     if median is None:

@@ -77,6 +77,20 @@ def check_count(count: int, what: str) -> int:
     return count
 
 
+def exponent_of(values: Values) -> int:
+    """Return the least n for which all values, divided by 2 to the power n, lie within -1 and 1.
+
+    To divide by a power of two rounds nothing, and sums and squares of the quotients don't overflow.
+    """
+    return int(np.frexp(np.abs(values).max())[1])
+
+
+def mean_of(values: NDArray[np.float64]) -> float:
+    """Return the mean of values, shape (n,), also where their sum is too large for a float."""
+    exponent = exponent_of(values)
+    return float(np.ldexp(np.ldexp(values, -exponent).mean(), exponent))
+
+
 def variance(values: NDArray[np.float64]) -> float:
     """Return the unbiased variance of two values or more; exactly 0 where all are equal, which rounding may hide."""
     return 0.0 if values.min() == values.max() else float(values.var(ddof=1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.statistics.estimate import Values, finite_1d
+from analysis.statistics.estimate import Values, exponent_of, finite_1d
 
 
 def area_under_curve(
@@ -50,8 +50,9 @@ def area_under_curve(
         raise ValueError(f"cannot average a learning curve over {end:g} env steps")
     # numpy.interp holds the outermost values.
     places = np.concatenate([[0.0], steps[(steps > 0.0) & (steps < end)], [end]])
-    heights = np.interp(places, steps, values)
-    return float(((heights[1:] + heights[:-1]) / 2.0 * np.diff(places)).sum() / end)
+    exponent = exponent_of(values)
+    heights = np.interp(places, steps, np.ldexp(values, -exponent))
+    return float(np.ldexp(((heights[1:] + heights[:-1]) / 2.0 * np.diff(places)).sum() / end, exponent))
 
 
 def share_lost(returns: Values, *, baseline: float | None = None, num_last: int = 1) -> float | None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.statistics.estimate import Estimate, Values, check_level, finite_arrays, variance
+from analysis.statistics.estimate import Estimate, Values, check_level, finite_arrays, mean_of, variance
 from analysis.statistics.student_t import t_quantile
 
 _BLOCK_VALUES = 2_000_000
@@ -79,7 +79,7 @@ def moderated_means(settings: Sequence[Values]) -> ModeratedMeans:
     sizes = np.array([array.size for array in arrays])
     if sizes.max() < 2:
         raise ValueError("no setting has two seeds, so nothing is known of how seeds differ")
-    means = np.array([array.mean() for array in arrays])
+    means = np.array([mean_of(array) for array in arrays])
     with np.errstate(over="ignore"):
         own = np.array([variance(array) if array.size > 1 else np.nan for array in arrays])
     prior_df, prior_variance = _prior(own[sizes > 1], sizes[sizes > 1] - 1.0)

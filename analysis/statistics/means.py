@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.statistics.estimate import Estimate, Values, check_count, check_level, finite_1d
+from analysis.statistics.estimate import Estimate, Values, check_count, check_level, finite_1d, mean_of
 
 MIN_SEEDS_FOR_INTERVAL = 5
 _CHUNK_VALUES = 2_000_000
@@ -30,7 +30,7 @@ def iqm(values: Values) -> float:
     """
     array = np.sort(finite_1d(values))
     cut = array.size // 4
-    return float(array[cut : array.size - cut].mean())
+    return mean_of(array[cut : array.size - cut])
 
 
 def mean_with_ci(

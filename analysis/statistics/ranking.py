@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.statistics.estimate import Values, check_count, check_level
+from analysis.statistics.estimate import Values, check_count, check_level, exponent_of, finite_arrays
 from analysis.statistics.many_settings import ModeratedMeans, moderated_means
 
 _NUM_SPREADS = 100
@@ -113,10 +113,14 @@ def probability_of_being_best(
         Smyth 2004 for the variances.
     """
     check_count(num_draws, "num_draws")
-    fit = moderated_means(settings)
+    arrays = finite_arrays(settings, "settings")
+    # In units of a power of two, by which nothing is rounded, as the squares of small scores are lost.
+    exponent = exponent_of(np.concatenate(arrays))
+    fit = moderated_means([np.ldexp(array, -exponent) for array in arrays])
     means, num_settings = fit.means, fit.means.size
-    spread = 0.0 if means.min() == means.max() else float(means.std(ddof=1))
-    if spread == 0.0 or fit.standard_errors.max() == 0.0:
+    says_nothing = fit.standard_errors.max() == 0.0 or means.min() == means.max()
+    spread = 0.0 if says_nothing else float(means.std(ddof=1))
+    if spread == 0.0:
         leaders = means == means.max()
         return np.where(leaders, 1.0 / np.count_nonzero(leaders), 0.0)
     spreads, weights = _spread_posterior(means, fit.standard_errors**2, spread)

@@ -55,6 +55,16 @@ def test_a_seed_that_ended_early_is_held_and_the_curve_says_from_where() -> None
     assert curve.mean[-1] == 5.0
 
 
+def test_a_seed_without_a_return_is_counted_though_no_curve_is_of_it() -> None:
+    data = of_curves([(100, 0.0), (200, 4.0)], [(100, 2.0), (200, 6.0)], [])
+    trials = [*data.trials[:2], data.trials[2].model_copy(update={"status": "failed"})]
+    data = dataclasses.replace(data, trials=trials)
+    (curve,) = setting_curves(data, top=1)
+    assert (curve.num_seeds, curve.num_without, curve.mean[-1]) == (2, 1, 5.0)
+    (label,) = [text.get_text() for text in learning_figure([("mine", data)]).legends[0].get_texts()]
+    assert label.endswith("(2 of 3 seeds)")
+
+
 def test_one_seed_has_no_band() -> None:
     (curve,) = setting_curves(of_curves([(100, 0.0), (200, 1.0)]), top=1)
     assert curve.lower is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import subprocess
 import sys
@@ -136,6 +137,26 @@ def test_lr_is_the_axis_where_there_are_several_numbers() -> None:
     trials = make_sweep(points=points).trials
     assert numeric_names(trials) == ["lr", "gamma"]
     assert group_names(trials, "lr") == ["gamma", "use"]
+
+
+@pytest.mark.parametrize("values", [(None, 0.5, 10.0), ([64, 64], 64, 32), (math.nan, 0.1, 0.5), ("auto", 0.1, 0.5)])
+def test_what_is_no_number_in_some_trials_is_no_axis_of_numbers(values: tuple[Any, ...]) -> None:
+    sweep = make_sweep(points=[{"x": value} for value in values])
+    assert numeric_names(sweep.trials) == []
+
+    def places(name: str | None) -> list[float]:
+        axes = score_by_lr(sweep.trials, name=name).axes[0]
+        return [float(x) for each in axes.collections for x in np.asarray(each.get_offsets())[:, 0]]
+
+    # Beside each other, by the value.
+    assert sorted(round(place) for place in places(None)) == [0, 1, 2]
+    # On an axis that is asked for the first one has no place.
+    assert sorted(places("x")) == sorted(float(value) for value in values[1:])
+
+
+def test_trials_whose_points_are_not_chosen_yet_keep_an_axis() -> None:
+    trials = make_sweep(points=[{"lr": 1e-3}, {"lr": 2e-3}, {}], pending={2}).trials
+    assert numeric_names(trials) == ["lr"]
 
 
 def test_a_hyperparameter_of_many_values_makes_no_groups() -> None:

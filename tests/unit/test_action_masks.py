@@ -69,6 +69,27 @@ def test_the_report_says_how_to_act_with_a_mask(tmp_path: Path, place: str, give
     assert acting_code(tmp_path / "nothing") == "action = policy.act(observation)"
 
 
+@pytest.mark.parametrize(
+    ("env_args", "mask"),
+    [
+        ({"place": "method"}, 'env.get_wrapper_attr("action_masks")()'),
+        ({"place": "info", "action_mask": True}, 'info["action_mask"]'),
+        ({"place": "info", "action_mask": "action_mask"}, 'info["action_mask"]'),
+    ],
+)
+def test_the_report_says_where_this_environment_has_its_mask(
+    tmp_path: Path, env_args: dict[str, Any], mask: str
+) -> None:
+    policy = policy_of(PPO, env_args, tmp_path / "best")
+    code = acting_code(tmp_path / "best")
+    assert code.partition("mask=")[2].startswith(f"{mask})")
+    env = gym.make(ENV, **{name: value for name, value in env_args.items() if name != "action_mask"})
+    observation, info = env.reset(seed=0)
+    known: dict[str, Any] = {"policy": policy, "observation": observation, "env": env, "info": info}
+    exec(code, known)
+    assert env.action_space.contains(known["action"])
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_what_is_observed_begins_with_the_mask(place: str) -> None:
     info = check_env(ENV, PLACES[place], "dqn")

@@ -205,6 +205,15 @@ def test_a_suffix_is_added_and_a_folder_for_tables_is_no_file(tmp_path: Path, mo
         tune_jobs.export("mine", "csv", output="mine.tex", storage=tmp_path)
 
 
+def test_without_a_format_the_suffix_says_it(tmp_path: Path) -> None:
+    make_sweep_folder(tmp_path / "mine")
+    for kind, read in (("csv", pd.read_csv), ("parquet", pd.read_parquet)):
+        for suffix in (kind, kind.upper()):
+            paths = tune_jobs.export("mine", output=tmp_path / f"out.{suffix}", storage=tmp_path)
+            assert paths["trials"] == tmp_path / f"out.{suffix}" / f"trials.{kind}"
+            assert len(read(paths["trials"])) == 4
+
+
 def test_a_folder_that_is_there_gets_a_file_of_the_usual_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = make_sweep_folder(tmp_path / "sweeps" / "mine")
     (tmp_path / "here").mkdir()

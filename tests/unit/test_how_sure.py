@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from report_sources import setting, settings_of, source_of
 from synthetic_sweep import make_points, make_sweep
 
@@ -45,6 +46,20 @@ def test_labels_that_are_too_long_are_left_to_the_table() -> None:
 
     assert labels({"activation": "relu"}) == ["1.  0.001 · relu", "2.  0.003 · relu"]
     assert labels({f"name{index}": "a long value" for index in range(4)}) == ["1.", "2."]
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        ([{"double_q": True, "lr": 3e-3}, {"double_q": False, "n_step": 2, "tau": 0.5, "lr": 3e-6}], "double_q True, "),
+        ([{"grad_clip": None, "lr": 3e-3}, {"grad_clip": 0.5, "lr": 3e-6}], "grad_clip –, "),  # noqa: RUF001
+        ([{"hidden_sizes": [64, 64], "lr": 3e-3}, {"n_step": 2, "lr": 3e-6}], "hidden_sizes 64x64, "),
+    ],
+)
+def test_what_solves_first_is_told_by_what_acts_in_it(points: list[dict[str, Any]], said: str) -> None:
+    synthetic = make_sweep(points=points, threshold=195.0)
+    text = how_sure.fewest_env_steps(synthetic.trials, synthetic.results, 195.0)
+    assert text.startswith(f"{said}lr 0.003 reaches a mean training return of 195 ")
 
 
 def test_nothing_is_compared_where_there_is_one_setting() -> None:

@@ -44,6 +44,13 @@ def test_the_command_prints_the_same(folder: Path) -> None:
     assert "tanh" in printed
 
 
+def test_of_too_few_points_nothing_is_said_to_be_adjusted(tmp_path: Path) -> None:
+    make_sweep_folder(tmp_path / "few", space={"train_batch_size": {"grid": [2000, 4000]}}, num_samples=1)
+    printed = run(str(tmp_path / "few"))
+    assert "Scores by value: return in the later half of training\n" in printed
+    assert "adjusted for" not in printed
+
+
 def test_json_has_every_field(folder: Path) -> None:
     told = json.loads(run(str(folder), "--json"))
     assert {item["name"] for item in told["hyperparams"]} == {"lr", "activation"}

@@ -14,6 +14,7 @@ from analysis.objectives import SettingScores, expected_means, rank_settings, sc
 from analysis.racing import Race
 from analysis.records import IterationRecord, Objective, TrialRecord, TrialStatus
 from analysis.settings import judge_settings
+from analysis.statistics import area_under_curve, iqm
 from tests.narrowing import present
 
 CAP = 10_000
@@ -316,6 +317,28 @@ def test_steps_are_said_as_steps() -> None:
 
 def test_nothing_is_said_of_a_sweep_without_an_ended_trial() -> None:
     assert judge_settings([], {}, num_env_steps=CAP, threshold=None) is None
+
+
+@pytest.mark.parametrize("scale", [1.7e308, -1.7e308, 1e-160, 1e-310])
+@pytest.mark.parametrize("objective", ["final", "area", "best"])
+def test_scores_of_any_size_have_means(scale: float, objective: Objective) -> None:
+    levels = [[1.0, 0.9, 0.8], [0.5, 0.6, 0.4], [0.75]]
+    settings = judged([[scale * level for level in seeds] for seeds in levels], objective)
+    assert settings.best.point_index == (0 if scale > 0 else 1)
+    for item in settings.ranking:
+        assert item.score == pytest.approx(scale * np.mean(levels[item.point_index]), rel=1e-6, abs=0.0)
+    # In another unit they are the same.
+    expected = dict(zip(range(3), expected_means(levels), strict=True))
+    for item in settings.ranking:
+        assert item.expected == pytest.approx(scale * expected[item.point_index], rel=1e-6, abs=0.0)
+
+
+def test_large_scores_of_both_signs_have_an_area_and_a_middle() -> None:
+    curve = [1.7e308, -1.7e308, 1.7e308, 0.0]
+    # Level, down and up again, and half of the way to 0: 1,000, 0, 0 and 375 times the first.
+    area = area_under_curve([1_000, 2_000, 3_000, 4_000], curve, num_env_steps=3_500)
+    assert area == pytest.approx(1.7e308 * (1.375 / 3.5))
+    assert iqm([1.7e308, 1.7e308, 1.6e308]) == pytest.approx(5.0 / 3.0 * 1e308)
 
 
 @pytest.mark.parametrize("value", [1e300, -1e300])

@@ -40,7 +40,10 @@ def show_importance(found: WhatMattered, *, as_json: bool) -> None:
 def _show_effects(console: Console, found: WhatMattered) -> None:
     from analysis.importance.words import SCORES, score_interval, score_text
 
-    console.print(f"Scores by value: {SCORES[found.objective]}; adjusted for the other hyperparameters")
+    # Of too few points nothing is.
+    is_adjusted = any(level.adjusted is not None for effect in found.effects for level in effect.levels)
+    how = "; adjusted for the other hyperparameters" if is_adjusted else ""
+    console.print(f"Scores by value: {SCORES[found.objective]}{how}")
     table = make_table("hyperparameter", "value", "points", "mean", "adjusted", "95 % interval")
     for effect in found.effects:
         for level in effect.levels:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from analysis.comparison.compare import MAX_ENTRIES, Comparison
+from analysis.comparison.compare import MAX_ENTRIES, Comparison, common_objective
 from analysis.comparison.compare import compare as compare_all
-from analysis.comparison.entries import Wanted
+from analysis.comparison.entries import Wanted, judged_alike, why_no_scores
 from analysis.exports.frames import ranked_settings
 from analysis.records import Objective
 from policies.arguments import PositiveInt, checked
@@ -73,7 +73,7 @@ def compared(
     """
     if not sources:
         raise SpecError("Nothing was given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials.")
-    wanted = _settings_of(*sources[0], top) if len(sources) == 1 else [_wanted(*each) for each in sources]
+    wanted = _settings_of(*sources[0], objective, top) if len(sources) == 1 else [_wanted(*each) for each in sources]
     _refuse_twice(wanted)
     if not 2 <= len(wanted) <= MAX_ENTRIES:
         raise SpecError(
@@ -105,21 +105,28 @@ def _of(store: Sweep, name: str, point_index: int | None) -> Wanted:
     return Wanted(name, record, sweep_data(store), cores, point_index)
 
 
-def _settings_of(store: Sweep, trial_id: str | None, top: int) -> list[Wanted]:
-    """Return the leading settings of a sweep, each called after its first trial."""
+def _settings_of(store: Sweep, trial_id: str | None, objective: Objective | None, top: int) -> list[Wanted]:
+    """Return the leading settings of a sweep by what they are compared by, each called after its first trial."""
     if trial_id is not None:
         raise SpecError(
             f"Only {store.name}/{trial_id} was given to be compared.", "Name another trial or sweep to compare it with."
         )
-    whole = wanted_sweep(store)
-    ranking = ranked_settings(whole.data)[:top]
-    if len(ranking) < 2:
-        raise NotFoundError(
-            f"Sweep {store.name} has no two settings that could be compared: "
-            f"{len(ranking)} of its settings {'has' if len(ranking) == 1 else 'have'} been trained and judged.",
-            "Name another sweep to compare it with.",
+    if top < 2:
+        raise SpecError(
+            f"Of sweep {store.name} alone {top} leading setting was to be compared.", "Let `top` be 2 or more."
         )
-    return [_of(store, f"{store.name}/{item.trial_ids[0]}", item.point_index) for item in ranking]
+    whole = wanted_sweep(store)
+    judged = judged_alike(whole, objective or common_objective([whole])[0], whole.data.threshold)
+    ranking = ranked_settings(judged.data)
+    if len(ranking) < 2:
+        why = "one of its settings alone has been trained and judged" if ranking else why_no_scores(judged)
+        raise NotFoundError(
+            f"Sweep {store.name} has no two settings that could be compared: {why}.",
+            "Ask for another objective."
+            if judged.data.objective == "steps_to_threshold" and judged.data.threshold is None
+            else "Name another sweep to compare it with.",
+        )
+    return [_of(store, f"{store.name}/{item.trial_ids[0]}", item.point_index) for item in ranking[:top]]
 
 
 def _refuse_twice(wanted: Sequence[Wanted]) -> None:

@@ -27,7 +27,8 @@ FIGURES = ("pdf", "svg", "png")
 _SUFFIXES: dict[Format, str] = {
     "latex": ".tex", "optuna": ".db", "pdf": ".pdf", "svg": ".svg", "png": ".png", "sweep": ".tunejobs",
 }  # fmt: skip
-_FORMATS_BY_SUFFIX = {suffix: kind for kind, suffix in _SUFFIXES.items()}
+_FORMATS_BY_SUFFIX: dict[str, Format] = {suffix: kind for kind, suffix in _SUFFIXES.items()}
+_FORMATS_BY_SUFFIX |= {".csv": "csv", ".parquet": "parquet"}
 
 
 @checked
@@ -122,7 +123,7 @@ def export(
         format: `csv` and `parquet` write a folder with a table each of trials, iterations, evaluations and settings;
             `latex` a table of the leading settings (booktabs); `optuna` a study in a SQLite file; `pdf`, `svg` and
             `png` the learning curves of the leading settings; `sweep` one file that the service's page shows whoever
-            opens it there. None: what the suffix of `output` says, such as `.tunejobs` or `.pdf`; else `csv`.
+            opens it there. None: what the suffix of `output` says, such as `.pdf` or `.parquet`; else `csv`.
         output: The folder (csv, parquet) or file to write; a folder that is there gets a file of the usual name. None:
             `NAME-csv`, `NAME-parquet`, `NAME.tex`, `NAME.db`, `NAME.tunejobs`, `NAME.pdf`, ... in the current folder.
         top: How many settings the LaTeX table (10) or the figure (3 of each sweep) shows.
@@ -195,18 +196,21 @@ def _figure(
     size: tuple[float, float],
 ) -> Figure:
     from analysis.exports.paper import learning_figure
+    from analysis.report_data import env_arguments_of, env_of
     from tune_jobs.sweeps.sources import find_sweep
 
     if not names:
         raise SpecError("No sweep was given to draw.", "Give one sweep, or several of one environment.")
     stores = [find_sweep(name, storage) for name in names]
     labels = _labels(stores)
-    envs = [spec_of(store).env for store in stores]
-    for label, env in zip(labels, envs, strict=True):
-        if (env.id, env.args) != (envs[0].id, envs[0].args):
+    records = [store.read_record() for store in stores]
+    first_id, first_arguments = env_of(records[0]), env_arguments_of(records[0])
+    for label, record in zip(labels, records, strict=True):
+        env_id = env_of(record)
+        if (env_id, env_arguments_of(record)) != (first_id, first_arguments):
             raise SpecError(
-                f"Sweep {labels[0]} is on {envs[0].id}, {label} on {env.id}"
-                f"{' with other arguments' if env.id == envs[0].id else ''}: their returns have no common axis.",
+                f"Sweep {labels[0]} is on {first_id}, {label} on {env_id}"
+                f"{' with other arguments' if env_id == first_id else ''}: their returns have no common axis.",
                 "Draw them one by one.",
             )
     data = [sweep_data(store) for store in stores]
