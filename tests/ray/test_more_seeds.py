@@ -92,6 +92,7 @@ def test_points_that_tpe_chose_are_trained_again(tmp_path: Path) -> None:
     )
     launch(tmp_path, given)
     result = replicate(tmp_path, top=2, seeds=1)
+    assert len(result.trials) == 6
     for trial in result.trials[4:]:
         assert trial.point == result.trials[trial.point_index].point
         assert trial.hyperparams == result.trials[trial.point_index].hyperparams

@@ -1,0 +1,76 @@
+"""Where the model of a population's intervals is at its limits: few intervals, many, a collapse, the ends of ranges."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+from analysis.records import IterationRecord
+from tune_jobs.search.bandit import MOST_INTERVALS, Gain, Next, _unit, _value, propose
+from tune_jobs.search.gains import Evaluations
+from tune_jobs.spec.domains import Domain
+from tune_jobs.store.sweep_store import SweepStore
+
+DOMAIN: TypeAdapter[Any] = TypeAdapter(Domain)
+SPACE = {"x": DOMAIN.validate_python({"uniform": [0.0, 1.0]})}
+
+
+def proposed(coming: Next, gains: list[Gain], seed: int = 0) -> dict[str, Any]:
+    return propose(coming, SPACE, gains, np.random.default_rng(seed), 0.25)
+
+
+@pytest.mark.parametrize("num", [2, 3])
+def test_two_known_intervals_are_enough_for_the_model(num: int) -> None:
+    gains = [Gain(1.0 + at, 0.0, float(at), {"x": 0.2 + 0.3 * at}) for at in range(num)]
+    assert 0.0 <= proposed(Next(num + 1.0, 0.0, {"x": 0.5}, []), gains)["x"] <= 1.0
+
+
+def test_the_newest_intervals_alone_are_modelled_in_whatever_order_they_come() -> None:
+    # Early on little was best, lately much is.
+    num = 2 * MOST_INTERVALS
+    places = np.random.default_rng(3).random(num)
+    best = [0.1 if at < MOST_INTERVALS else 0.9 for at in range(num)]
+    gains = [Gain(float(at), 0.0, 1.0 - abs(x - best[at]), {"x": float(x)}) for at, x in enumerate(places)]
+    coming = Next(float(num), 0.0, {"x": 0.5}, [{"x": 0.4}])
+    expected = proposed(coming, gains[-MOST_INTERVALS:])
+    assert expected["x"] > 0.7
+    assert proposed(coming, gains) == proposed(coming, gains[::-1]) == expected
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"loguniform": [1e-5, 1e-1]}, {"loguniform": [3e-6, 7e-3]}, {"uniform": [0.1, 0.7]}, {"uniform": [-0.3, 1.1]},
+        {"qloguniform": [0.01, 0.5, 0.01]}, {"lograndint": [3, 1000]}, {"one_minus_loguniform": [0.9, 0.9999]},
+        {"power_of_two": [8, 512]},
+    ],
+)  # fmt: skip
+def test_the_ends_of_a_range_are_in_it_whatever_rounding_makes_of_their_logarithms(given: dict[str, Any]) -> None:
+    domain = DOMAIN.validate_python(given)
+    for unit in (0.0, 1.0):
+        value = _value(domain, unit)
+        assert domain.gives(value), (given, value)
+        assert _unit(domain, value) == pytest.approx(unit, abs=1e-3)
+
+
+def test_evaluations_that_were_read_stay_known_while_the_results_can_not_be_read(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path / "mine")
+    store.create()
+    trial = store.trial("t0000")
+    known = IterationRecord(iteration=2, num_env_steps=200, num_episodes=2, time_s=1.0, evaluation_return=2.0)
+    trial.append_iterations([known])
+    evaluations = Evaluations(store)
+    before = evaluations(["t0000"])
+    assert [one.value for one in before["t0000"]] == [2.0]
+    results = trial.results_path
+    kept = results.read_bytes()
+    results.unlink()
+    results.mkdir()  # as bad as a disk that can't be read
+    assert evaluations(["t0000"]) == before
+    results.rmdir()
+    results.write_bytes(kept)
+    assert evaluations(["t0000"]) == before
