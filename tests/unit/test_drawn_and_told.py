@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compared_sweeps import wanted
 from sweep_folders import make_sweep_folder
 from synthetic_sweep import make_sweep_record
-from test_compare import wanted
 
 import tune_jobs
 from analysis.best_so_far import best_so_far
