@@ -1,5 +1,7 @@
 """The service's page in a browser, driven as a reader would: look, sort, filter, brush, submit, stop."""
 
+import httpx2
+import pytest
 from live_service import Live
 from page_browser import IN_A_BROWSER, Page
 from page_sweeps import HOSTILE, write_large
@@ -169,12 +171,15 @@ def test_a_sweep_is_submitted_stopped_and_refused_with_a_sentence(page: Page) ->
     page.says("main h1", "from-the-page")
     page.says(".sweep-title", "waiting")
     assert "two" in page.text(".tag-line")
-    # The name is taken now.
+    # The name is taken now, and said to be before it is submitted.
     page.open("#/new")
     page.says(".plan", "valid")
     page.one("#name").send_keys("from-the-page")
+    page.says(".plan", "A sweep 'from-the-page' is already in")
     page.button("Submit sweep").click()
     page.says(".submit .problem", "from-the-page")
+    page.one("#name").send_keys("-again")
+    page.says(".plan", "valid")
     page.open("#/sweeps/from-the-page")
     page.button("Stop").click()
     page.says(".sweep-title", "stopped")
@@ -209,9 +214,38 @@ def test_dialogs_show_what_is_refused_and_change_what_is_not(page: Page) -> None
     page.button("Note, tags, priority…").click()
     page.one("dialog textarea").send_keys(f"A note {HOSTILE}")
     page.one("dialog #field-tags").send_keys("baseline, baseline")
+    # Nothing of it waits for a turn.
+    assert page.text(".dialog h2") == "Note and tags of pendulum-no-space"
+    assert not page.browser.find_elements(By.CSS_SELECTOR, "dialog #field-priority")
     page.button("Save", "dialog").click()
     page.says(".note", HOSTILE)
     page.says(".tag-line", "baseline")
+
+
+def test_the_priority_of_what_waits_is_changed(page: Page, live: Live) -> None:
+    body = {"preset": "cartpole-ppo", "name": "waits", "priority": 3}
+    assert httpx2.post(f"{live.url}/api/v1/sweeps", json=body, timeout=60).status_code == 201
+    page.open("#/sweeps/waits")
+    page.says(".sweep-title", "waiting")
+    page.button("More").click()
+    page.button("Note, tags, priority…").click()
+    assert page.text(".dialog h2") == "Note, tags and priority of waits"
+    field = page.one("dialog #field-priority")
+    assert field.get_attribute("value") == "3"
+    field.send_keys(Keys.CONTROL, "a")
+    field.send_keys("7")
+    page.button("Save", "dialog").click()
+    page.wait("return document.querySelector('.dialog') === null")
+    assert [job.priority for job in live.service.queue.jobs(sweep="waits")] == [7]
+
+
+def test_a_plan_that_had_no_turn_is_asked_for_again(page: Page, live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live.service.planning, "wait_s", 0.1)
+    monkeypatch.setattr(live.service.planning, "at_once", 0)
+    page.open("#/new")
+    page.says(".plan", "Too many sweeps are being planned")
+    monkeypatch.undo()
+    page.says(".plan", "valid")
 
 
 def test_a_sweep_is_deleted_only_when_it_was_meant(page: Page, live: Live) -> None:

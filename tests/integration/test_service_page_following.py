@@ -10,6 +10,7 @@ from page_sweeps import write_sweep
 from selenium import webdriver
 from synthetic_sweep import make_sweep
 
+from tune_jobs.service import watching
 from tune_jobs.store.sweep_store import SweepStore
 
 pytestmark = IN_A_BROWSER
@@ -41,6 +42,15 @@ NOTED = """
     };
     location.hash = "#/sweeps/mine";
 """
+
+LATE = NOTED.replace(
+    "return ask(url, options);",
+    """
+      if (!String(url).includes("/trials?")) return ask(url, options);
+      window.isLate = true;
+      return new Promise((resolve) => setTimeout(resolve, 3000)).then(() => ask(url, options));
+    """,
+)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +101,27 @@ def test_a_page_whose_events_are_refused_asks_less_and_less_often(browser: webdr
         page.says("#link-state", "Not connected")
         first, second, third = page.wait("return window.moments.length > 2 && window.moments.slice(0, 3)")
         assert third - second > 1.6 * (second - first)
+
+
+def test_a_sweep_that_takes_long_to_load_is_loaded_once(
+    page: Page, live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "LINGER_S", 0.2)
+    store = SweepStore(live.storage / "mine")
+    record = store.read_record()
+    page.open("#/new")
+    page.run(LATE)
+    page.wait("return window.isLate")
+    try:
+        # What comes while it loads is shown, too, and it goes on from there.
+        store.write_record(record.model_copy(update={"state": "interrupted"}))
+        page.says(".sweep-title", "interrupted")
+        page.says(".trials-card", "3 trials")
+        store.write_record(record)
+        page.says(".sweep-title", "completed")
+    finally:
+        store.write_record(record)
+    assert page.run("return window.moments.length") == 1
 
 
 def test_a_list_that_is_older_than_an_event_takes_nothing_back(page: Page, live: Live) -> None:

@@ -250,6 +250,16 @@ def test_a_file_that_a_client_has_is_not_sent_again(site: Live) -> None:
     assert first.headers["cache-control"] == "private, no-cache"
 
 
+@pytest.mark.parametrize("path", ["/report/", "/report/figures/curves.svg", "/films/after_mp4"])
+def test_a_file_that_a_client_has_may_do_what_it_might_before(site: Live, path: str) -> None:
+    """Of an answer 304, a browser takes each header over into what it has stored, and leaves the others."""
+    first = get(site, path).headers
+    again = get(site, path, **{"If-None-Match": first["etag"]})
+    assert again.status_code == 304
+    names = ("content-security-policy", "content-type", "cache-control", "etag", "last-modified")
+    assert {name: (first | again.headers)[name] for name in names} == {name: first[name] for name in names}
+
+
 def test_heads_are_answered_as_downloads_are(site: Live) -> None:
     for path in ("report/index.html", "films/after_mp4", "policy/policy.json"):
         answer = httpx2.head(f"{site.url}/api/v1/sweeps/mine/{path}")

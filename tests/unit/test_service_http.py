@@ -151,10 +151,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("path", "case"),
-    [("sweeps", case) for case in WRONG] + [("plans", case) for case, (body, _) in WRONG.items() if "name" not in body],
-)
+@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("path", ["sweeps", "plans"])
 def test_what_is_wrong_is_said_and_nothing_is_made(client: TestClient, service: Service, case: str, path: str) -> None:
     body, told = WRONG[case]
     found = problem(client.post(f"/api/v1/{path}", json=body), 422)
@@ -172,8 +170,11 @@ def test_bodies_that_are_none(client: TestClient, body: bytes) -> None:
 
 
 def test_a_name_that_is_taken_is_refused(client: TestClient, finished: str, service: Service) -> None:
-    answer = client.post("/api/v1/sweeps", json={"spec": FAKE, "name": finished})
-    assert "'done'" in problem(answer, 422)["detail"]
+    for body in ({"spec": FAKE, "name": finished}, {"spec": FAKE | {"name": finished}}):
+        answer = client.post("/api/v1/sweeps", json=body)
+        assert "'done'" in problem(answer, 422)["detail"]
+        assert client.post("/api/v1/plans", json=body).json() == answer.json()
+    assert client.post("/api/v1/plans", json={"spec": FAKE, "default_name": finished}).status_code == 200
     assert service.queue.jobs() == []
 
 

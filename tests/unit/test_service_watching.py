@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from store_parts import make_iteration
 from sweep_folders import make_sweep_folder
 
 from tune_jobs.service import statuses as module
+from tune_jobs.service import watching
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.service import opened
@@ -270,6 +272,53 @@ class Quiet:
 
     def changes(self) -> list[Any]:
         return []
+
+
+class Slow(Quiet):
+    """One whose first look takes a while; later ones take none."""
+
+    interval_s = 0.05
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+
+    def changes(self) -> list[Any]:
+        time.sleep(self.seconds)
+        self.seconds = 0.0
+        return []
+
+
+def has_ended(follower: Follower, within_s: float) -> bool:
+    """Whether a follower ends within some seconds."""
+    deadline = time.monotonic() + within_s
+    while not follower.log.has_ended and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return follower.log.has_ended
+
+
+def test_what_was_looked_at_for_longer_than_one_lingers_is_followed_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watching, "LINGER_S", 0.5)
+    follower = Follower("it", Slow(1.0), EventLog("s"))
+    follower.begin()
+    assert not has_ended(follower, 0.25)
+    assert has_ended(follower, 20)
+
+
+def test_what_somebody_has_asked_for_is_followed_until_they_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page has the curves, and loads trials for minutes before it watches."""
+    monkeypatch.setattr(watching, "LINGER_S", 0.1)
+    monkeypatch.setattr(watching, "AWAITED_S", 2.0, raising=False)
+    for comes in (False, True):
+        follower = Follower("it", Slow(0.0), EventLog("s"))
+        follower.begin()
+        follower.curves(10)
+        assert not has_ended(follower, 1.0)
+        if comes:
+            with follower.log.listening(lambda: None):
+                time.sleep(0.3)
+            # Whoever leaves does not leave it to others for so long.
+            assert has_ended(follower, 0.7)
+        assert has_ended(follower, 20)
 
 
 class Pauses:

@@ -156,7 +156,11 @@ class Client(Looking):
         note: str | None = None,
         tags: Sequence[str] | None = None,
     ) -> Summary:
-        """Change a sweep's priority, note or tags; what is None stays."""
+        """Change a sweep's priority, note or tags; what is None stays.
+
+        Raises:
+            ConflictError: A priority is given, and no job of the sweep waits.
+        """
         given = {"priority": priority, "note": note, "tags": None if tags is None else list(tags)}
         body = {key: value for key, value in given.items() if value is not None}
         return self._read(Summary, self._ask("PATCH", sweep_path(name), body=body, repeat=True))

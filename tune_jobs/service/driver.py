@@ -17,7 +17,7 @@ import sys
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from policies.envs.modules import allow_modules
 from policies.errors import CannotRunError, TuneJobsError
@@ -25,6 +25,9 @@ from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
 from tune_jobs.store.urls import name_of_place, outer_place
+
+if TYPE_CHECKING:
+    from tune_jobs.spec.sweep_spec import SweepSpec
 
 _log = logging.getLogger(__name__)
 
@@ -141,6 +144,16 @@ def _ended(request: Mapping[str, Any]) -> Ended:
 
 
 def _done(request: Mapping[str, Any]) -> Any:
+    from tune_jobs.sweeps.drive import within_cpus
+
+    if request["address"] is not None:
+        return _driven(request)
+    # The others are those of other jobs, whatever this one could make of them.
+    with within_cpus(max(request["num_cpus"], _spec_of(request["sweep"]).cpus_per_trial)):
+        return _driven(request)
+
+
+def _driven(request: Mapping[str, Any]) -> Any:
     from tune_jobs.sweeps import verbs
 
     place, arguments = request["sweep"], request["arguments"]
@@ -149,13 +162,9 @@ def _done(request: Mapping[str, Any]) -> Any:
     }  # fmt: skip
     match request["verb"]:
         case "extend":
-            from tune_jobs.spec.file import stored_spec
-            from tune_jobs.store.opening import open_sweep
-
             # The job says how many samples there are to be in all, so that an attempt that follows a killed one adds
             # none twice.
-            known = stored_spec(open_sweep(place).read_record()).num_samples
-            missing = arguments["to_num_samples"] - known
+            missing = arguments["to_num_samples"] - _spec_of(place).num_samples
             if missing > 0:
                 return verbs.extend(place, missing, **common)
             return verbs.resume(place, **common)
@@ -168,6 +177,13 @@ def _done(request: Mapping[str, Any]) -> Any:
             return verbs.resume(place, retry_failed=True, **common)
         case _:
             return verbs.resume(place, **common)
+
+
+def _spec_of(place: str) -> SweepSpec:
+    from tune_jobs.spec.file import stored_spec
+    from tune_jobs.store.opening import open_sweep
+
+    return stored_spec(open_sweep(place).read_record())
 
 
 def _has_point(place: str, point: Mapping[str, Any]) -> bool:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from analysis.records import SweepRecord, TrialRecord
+from analysis.records import FINISHED, SweepRecord, TrialRecord
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, make_hyperparams
 from tune_jobs.plan.estimates import max_env_steps
@@ -36,6 +36,25 @@ def num_samples_after(spec: SweepSpec, jobs: Iterable[Job]) -> int:
     return max([spec.num_samples, *asked])
 
 
+def num_trials_after(record: SweepRecord, spec: SweepSpec, *, jobs: Sequence[Job], more: Addition) -> int:
+    """Return the most trials that a sweep will have, once its jobs that wait or run are done, and an addition is.
+
+    They are counted as they will be planned: those that there are now may be fewer than the sweep's spec says.
+
+    Args:
+        record: The sweep.
+        spec: Its spec.
+        jobs: Its jobs that wait or run.
+        more: What is to be added.
+    """
+    wanted = spec.model_copy(update={"num_samples": num_samples_after(spec, jobs) + more.num_samples})
+    num_new = len(_new_points(record, jobs, more))
+    total = num_trials_of(wanted, record.replications, record.chosen_points) + num_new * spec.seeds_per_point
+    races = [(int(job.arguments["top"]), int(job.arguments["seeds"])) for job in jobs if job.verb == "replicate"]
+    num_points = num_points_of(wanted, record.chosen_points) + num_new
+    return total + sum(min(top, num_points) * seeds for top, seeds in [*races, (more.top, more.seeds)])
+
+
 def check_growth(
     limits: Limits,
     record: SweepRecord,
@@ -58,28 +77,52 @@ def check_growth(
     Raises:
         SpecError: It would have too many trials, or might train too many env steps.
     """
-    wanted = spec.model_copy(update={"num_samples": num_samples_after(spec, jobs) + more.num_samples})
-    known = [item.point for item in record.chosen_points]
-    asked = [job.arguments["point"] for job in jobs if job.verb == "inject"]
-    points = [*(point for point in asked if point not in known), *more.points]
-    # Counted as they will be planned: those that there are now may be fewer than the sweep's spec says.
-    total = num_trials_of(wanted, record.replications, record.chosen_points) + len(points) * spec.seeds_per_point
-    races = [(int(job.arguments["top"]), int(job.arguments["seeds"])) for job in jobs if job.verb == "replicate"]
-    num_points = num_points_of(wanted, record.chosen_points) + len(points)
-    total += sum(min(top, num_points) * seeds for top, seeds in [*races, (more.top, more.seeds)])
+    total = num_trials_after(record, spec, jobs=jobs, more=more)
     if total > limits.trials:
         raise SpecError(
             f"The sweep would have {total:,} trials; here a sweep may have at most {limits.trials:,}.", "Add fewer."
         )
     if limits.env_steps is None:
         return
-    steps = [max_env_steps(spec, values) for values in _hyperparams(spec, trials, points)]
+    steps = [max_env_steps(spec, values) for values in _hyperparams(spec, trials, _new_points(record, jobs, more))]
     # Of points that are not drawn yet, the largest known stands for all.
     most = sum(steps[: len(trials)]) + max(0, total - len(trials)) * max(steps)
     if most > limits.env_steps:
         raise SpecError(
             f"The sweep might train {most:,} env steps; here it may train at most {limits.env_steps:,}.", "Add fewer."
         )
+
+
+def num_cpus_after(
+    record: SweepRecord,
+    spec: SweepSpec,
+    trials: Sequence[TrialRecord],
+    *,
+    jobs: Sequence[Job],
+    more: Addition,
+    retry_failed: bool = False,
+) -> int:
+    """Return how many CPUs a sweep can use at most once something is added: as if all that is left ran at once.
+
+    Args:
+        record: The sweep.
+        spec: Its spec.
+        trials: Its trials so far.
+        jobs: Its jobs that wait or run.
+        more: What is to be added.
+        retry_failed: Whether its failed trials run again.
+    """
+    # A race trains each of its settings once, then again those that are still in it.
+    at_once = replace(more, seeds=min(1, more.seeds))
+    ended = sum(trial.status in FINISHED and not (retry_failed and trial.status == "failed") for trial in trials)
+    return max(1, num_trials_after(record, spec, jobs=jobs, more=at_once) - ended) * spec.cpus_per_trial
+
+
+def _new_points(record: SweepRecord, jobs: Sequence[Job], more: Addition) -> list[dict[str, Any]]:
+    """Return the points of somebody's choice that the sweep does not have yet."""
+    known = [item.point for item in record.chosen_points]
+    asked = [job.arguments["point"] for job in jobs if job.verb == "inject"]
+    return [*(point for point in asked if point not in known), *more.points]
 
 
 def _hyperparams(spec: SweepSpec, trials: Sequence[TrialRecord], points: Sequence[dict[str, Any]]) -> list[Hyperparams]:

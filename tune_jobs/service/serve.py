@@ -15,6 +15,7 @@ import uvicorn
 from policies.errors import CannotRunError
 from tune_jobs.service.access.hosts import public_host
 from tune_jobs.service.config import ServiceConfig
+from tune_jobs.service.connections import HeadTimeoutProtocol, many_files
 from tune_jobs.service.http.app import make_app
 from tune_jobs.service.service import Service, opened
 
@@ -39,7 +40,7 @@ def serve(config: ServiceConfig, on_start: Callable[[str], None] = lambda _: Non
         public_host(name)
     _check_tls(config)
     listening = listening_socket(config)
-    with listening, opened(config) as service, rare_collections():
+    with listening, many_files(), opened(config) as service, rare_collections():
         port = listening.getsockname()[1]
         app = make_app(service)
         host = f"[{config.host}]" if ":" in config.host else config.host
@@ -91,6 +92,7 @@ class Server(uvicorn.Server):
                 ssl_keyfile=None if config.tls_key is None else str(config.tls_key),
                 timeout_graceful_shutdown=5,
                 timeout_keep_alive=30,
+                http=HeadTimeoutProtocol,
                 h11_max_incomplete_event_size=64 * 1024,
             )
         )
@@ -105,11 +107,14 @@ class Server(uvicorn.Server):
         """Take no more requests, end what goes on, and let running sweeps save."""
         import anyio
 
+        self._service.planning.close()
+        # Those of requests may all be taken, by what takes long.
+        own_threads = anyio.CapacityLimiter(1)
         # Streams would go on for ever; what they are about is not over, so clients come back.
-        await anyio.to_thread.run_sync(self._service.watching.close)
+        await anyio.to_thread.run_sync(self._service.watching.close, limiter=own_threads)
         await super().shutdown(sockets)
         _log.info("Running sweeps save, for at most %g s.", self._drain_s)
-        if not await anyio.to_thread.run_sync(self._service.supervisor.drain, self._drain_s):
+        if not await anyio.to_thread.run_sync(self._service.supervisor.drain, self._drain_s, limiter=own_threads):
             _log.warning("Some sweeps did not save in time; they run on, and the next start finds them.")
 
 

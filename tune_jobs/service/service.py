@@ -34,6 +34,7 @@ from tune_jobs.service.submitting import Submitter
 from tune_jobs.service.supervisor import Supervisor
 from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.service.telling import Teller
+from tune_jobs.service.turns import Turns
 from tune_jobs.service.watching import Watching
 from tune_jobs.store.contract import Storage
 from tune_jobs.store.opening import open_storage
@@ -60,6 +61,8 @@ class Service:
     adding: threading.RLock = field(default_factory=threading.RLock)
     """Held from the look at what a sweep's jobs ask for until one is added: of those that come at once, each sees those
     before it."""
+    planning: Turns = field(default_factory=Turns)
+    """At planning sweeps, which takes seconds each."""
 
 
 @contextlib.contextmanager

@@ -85,10 +85,13 @@ class Submitter:
         """Validate a sweep, and return what would run; nothing is written.
 
         Raises:
-            SpecError: The sweep is wrong, or not allowed here.
+            SpecError: The sweep is wrong or not allowed here, or its name is one that no new sweep may have.
             DoesNotFitError: It needs more than this machine has.
         """
-        return self._planned(submission)
+        spec, plan = self._planned(submission)
+        # What a submission would refuse is not called valid.
+        self._free_name(submission, spec)
+        return spec, plan
 
     @allowed_again()
     @guarding(start=True)

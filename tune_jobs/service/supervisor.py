@@ -332,6 +332,7 @@ class Supervisor:
                 "verb": job.verb,
                 "arguments": job.arguments,
                 "address": self._where.address,
+                "num_cpus": job.num_cpus,
                 "wait_for_nodes": job.arguments.get("wait_for_nodes", self._where.wait_for_nodes),
             }
             try:

@@ -24,6 +24,9 @@ _log = logging.getLogger(__name__)
 
 LINGER_S = 30.0
 """How long something is followed when nobody watches it any more: whoever comes back finds what came meanwhile."""
+AWAITED_S = 300.0
+"""How long it is followed for whoever has asked for its curves and does not watch yet: they load its trials meanwhile,
+of which there may be many and the way long, and without what came since they would have to begin anew."""
 MOST_UNWATCHED = 32
 """How many are followed that nobody watches."""
 _MOST_WAIT_S = 5.0
@@ -45,6 +48,7 @@ class Follower:
     def __init__(self, what: str, view: View, log: EventLog) -> None:
         self._what, self._view, self.log = what, view, log
         self.used_at = time.monotonic()
+        self._awaited_until = self.used_at
         self._looking = threading.Lock()
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
@@ -60,6 +64,8 @@ class Follower:
             if self._thread is None:
                 with impatient():
                     self.log.add(self._view.changes())
+                # The first look at a large sweep may take longer than one lingers.
+                self.used_at = time.monotonic()
                 self._thread = threading.Thread(target=self._run, name=f"watch {self._what}", daemon=True)
                 self._thread.start()
 
@@ -82,6 +88,7 @@ class Follower:
         """Return the id of the last event and, of a sweep, the curves as of then: at most so many points a trial."""
         with self._looking:
             curves = self._view.curves.columns(most) if isinstance(self._view, SweepView) else {}
+            self._awaited_until = time.monotonic() + AWAITED_S
             return self.log.last_id, curves
 
     def _run(self) -> None:
@@ -89,8 +96,8 @@ class Follower:
         while not self._over.wait(wait_s):
             began = time.monotonic()
             if self.is_watched:
-                self.used_at = began
-            elif began - self.used_at > LINGER_S:
+                self.used_at = self._awaited_until = began
+            elif began > max(self.used_at + LINGER_S, self._awaited_until):
                 break
             try:
                 with self._looking, impatient():

@@ -33,8 +33,10 @@ def with_security_headers(send: Send, path: str) -> Send:
             headers = MutableHeaders(scope=message)
             for name, value in _ALWAYS.items():
                 headers.setdefault(name, value)
-            is_page = headers.get("content-type", "").startswith("text/html")
-            headers.setdefault("Content-Security-Policy", PAGE_POLICY if is_page else DATA_POLICY)
+            # The browser has the file with its own policy, which it would replace by the default one.
+            if message.get("status") != 304:
+                is_page = headers.get("content-type", "").startswith("text/html")
+                headers.setdefault("Content-Security-Policy", PAGE_POLICY if is_page else DATA_POLICY)
             if path.startswith("/api/"):
                 # What one person may see stays in no cache that others use.
                 headers.setdefault("Cache-Control", "no-store")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
 from tune_jobs.service.access.callers import Caller
-from tune_jobs.service.growth import Addition, check_growth, num_samples_after
+from tune_jobs.service.growth import Addition, check_growth, num_cpus_after, num_samples_after
 from tune_jobs.service.http.caller import AChanger, TheService
 from tune_jobs.service.http.models import WAIT_FOR_NODES, Extend, Inject, Replicate
 from tune_jobs.service.http.problems import NotNowError
@@ -26,6 +27,7 @@ router = APIRouter(
     responses=problems({409: "It contradicts what the sweep does just now, or was asked for already."}),
 )
 
+_NOTHING = Addition()
 Wait = Annotated[float | None, Query(**WAIT_FOR_NODES)]
 
 
@@ -63,11 +65,12 @@ def retry(name: str, service: TheService, caller: AChanger, wait_for_nodes: Wait
 def extend(name: str, more: Extend, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Add points to a sweep, and run them."""
     check_extendable(stored_spec(service.statuses.see(name).status.sweep), more.num_samples)
+    added = Addition(num_samples=more.num_samples)
     with service.adding:
-        num_samples = _check_growth(service, name, Addition(num_samples=more.num_samples))
+        num_samples = _check_growth(service, name, added)
         # How many there are to be in all, so that a job that is repeated after a kill adds none twice.
         arguments = {"to_num_samples": num_samples + more.num_samples}
-        return _enqueue(service, caller, name, "extend", arguments, wait_for_nodes)
+        return _enqueue(service, caller, name, "extend", arguments, wait_for_nodes, added)
 
 
 @router.post("/trials", status_code=202)
@@ -78,18 +81,20 @@ def inject(name: str, chosen: Inject, service: TheService, caller: AChanger, wai
     spec = stored_spec(record)
     # As the sweep writes it, so that a request that says the same in other words is known to be the same.
     point = new_point(record, spec, trials, chosen.point)
+    added = Addition(points=[point])
     with service.adding:
-        _check_growth(service, name, Addition(points=[point]))
-        return _enqueue(service, caller, name, "inject", {"point": point}, wait_for_nodes)
+        _check_growth(service, name, added)
+        return _enqueue(service, caller, name, "inject", {"point": point}, wait_for_nodes, added)
 
 
 @router.post("/replicate", status_code=202)
 def replicate(name: str, race: Replicate, service: TheService, caller: AChanger, wait_for_nodes: Wait = None) -> Job:
     """Train the leading settings again with fresh seeds."""
     check_replicable(stored_spec(service.statuses.see(name).status.sweep))
+    added = Addition(top=race.top, seeds=race.seeds)
     with service.adding:
-        _check_growth(service, name, Addition(top=race.top, seeds=race.seeds))
-        return _enqueue(service, caller, name, "replicate", race.model_dump(), wait_for_nodes)
+        _check_growth(service, name, added)
+        return _enqueue(service, caller, name, "replicate", race.model_dump(), wait_for_nodes, added)
 
 
 def _check_growth(service: Service, name: str, more: Addition) -> int:
@@ -109,17 +114,49 @@ def _enqueue(  # noqa: PLR0917 (all of them are one request)
     verb: Verb,
     arguments: Mapping[str, Any],
     wait_for_nodes: float | None,
+    more: Addition = _NOTHING,
 ) -> Job:
     service.statuses.see(name)
     wait = waiting_arguments(service.config, wait_for_nodes)
     with service.adding:
-        for job in service.queue.jobs("waiting", "running", sweep=name):
+        jobs = service.queue.jobs(sweep=name)
+        for job in jobs:
+            if job.state not in ("waiting", "running"):
+                continue
             # How long it waits for nodes makes it no other job.
             asked = {key: value for key, value in job.arguments.items() if key != "wait_for_nodes"}
             if job.verb == verb and asked == dict(arguments) and not job.stop_requested:
                 raise NotNowError(f"Sweep {name} has that job already: number {job.id}, which is {job.state}.")
-        last = service.queue.jobs(sweep=name)
-        num_cpus = last[-1].num_cpus if last else service.supervisor.where.unplanned_cpus
-        job, _ = service.queue.begin(name, verb, {**arguments, **wait}, owner=caller.name, num_cpus=num_cpus)
+        job, _ = service.queue.begin(
+            name,
+            verb,
+            {**arguments, **wait},
+            owner=caller.name,
+            priority=jobs[-1].priority if jobs else 0,
+            num_cpus=_num_cpus(service, name, verb, jobs, more),
+        )
     service.supervisor.wake()
     return job
+
+
+def _num_cpus(service: Service, name: str, verb: Verb, jobs: Sequence[Job], more: Addition) -> float:
+    """Return how many CPUs a further job of a sweep takes: its driver plans the sweep for so many.
+
+    They are no fewer than those of the last one, of which a plan may have made more of than its trials need.
+    """
+    most = service.supervisor.where.num_cpus
+    if not jobs:
+        return service.supervisor.where.unplanned_cpus
+    if not math.isfinite(most):
+        return jobs[-1].num_cpus
+    seen = service.statuses.see(name)
+    record = seen.status.sweep
+    wanted = num_cpus_after(
+        record,
+        stored_spec(record),
+        seen.trials.records,
+        jobs=[job for job in jobs if job.state in ("waiting", "running")],
+        more=more,
+        retry_failed=verb == "retry",
+    )
+    return min(most, max(jobs[-1].num_cpus, wanted))

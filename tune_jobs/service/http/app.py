@@ -22,6 +22,7 @@ from tune_jobs.service.http import (
     record_routes,
     sweep_routes,
 )
+from tune_jobs.service.http.compression import CompressionMiddleware
 from tune_jobs.service.http.openapi import complete
 from tune_jobs.service.http.problems import add_handlers
 from tune_jobs.service.http.requests import RequestMiddleware
@@ -39,7 +40,8 @@ class _App(FastAPI):
     @override
     def build_middleware_stack(self) -> ASGIApp:
         # What is refused is counted, too.
-        return RequestMiddleware(AccessMiddleware(super().build_middleware_stack(), self._gate), self._metrics)
+        compressing = CompressionMiddleware(super().build_middleware_stack())
+        return RequestMiddleware(AccessMiddleware(compressing, self._gate), self._metrics)
 
     @override
     def openapi(self) -> dict[str, Any]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from typing import Annotated, cast
 
 from fastapi import Depends, HTTPException, Request
 
 from tune_jobs.service.access.callers import RANK, Caller
 from tune_jobs.service.access.credentials import CHALLENGE
+from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.service import Service
+from tune_jobs.service.turns import Turn
+
+_AGAIN_S = 10
+"""Seconds after which somebody may ask again who has had no turn."""
 
 
 def service_of(request: Request) -> Service:
@@ -56,8 +62,36 @@ def set_audit_target(request: Request, sweep: str) -> None:
     request.state.audit_target = sweep
 
 
+async def planning_turn(request: Request) -> AsyncIterator[Turn]:
+    """Wait for a turn at planning, and give it: those who plan much leave threads for others.
+
+    Raises:
+        RefusedError: None came in time, whoever asked has left meanwhile, or the service ends.
+    """
+    turns = service_of(request).planning
+    async with turns.turn(submitter_of(request).name) as turn:
+        if not turn.has_come and turns.is_closed:
+            again = {"Retry-After": str(_AGAIN_S)}
+            raise RefusedError(
+                503, "The service is ending, and plans no more.", "Send it again once it is back.", again
+            )
+        if not turn.has_come:
+            raise RefusedError(
+                429,
+                f"Too many sweeps are being planned: at most {turns.of_one} of one person at once, and {turns.at_once} "
+                f"of all. No turn came within {turns.wait_s:g} s.",
+                f"Send it again in {_AGAIN_S} s.",
+                {"Retry-After": str(_AGAIN_S)},
+            )
+        if await request.is_disconnected():
+            # Nobody reads this: the page asks anew with each change of a sweep file, and leaves what it asked before.
+            raise RefusedError(408, "Whoever asked has left before the turn came.", "Send it again.")
+        yield turn
+
+
 TheService = Annotated[Service, Depends(service_of)]
 TheCaller = Annotated[Caller, Depends(caller_of)]
 ASubmitter = Annotated[Caller, Depends(submitter_of)]
 AnAdmin = Annotated[Caller, Depends(admin_of)]
 AChanger = Annotated[Caller, Depends(changer_of)]
+ATurn = Annotated[Turn, Depends(planning_turn)]

@@ -24,6 +24,7 @@ _PLAIN_NAME = re.compile(r"[\w.-]+", re.ASCII)
 _CHUNK_BYTES = 256 * 1024
 _FIRST_DAY = (1980, 1, 1, 0, 0, 0)
 _ZIP64_BYTES = 2**31 - 1
+_OF_NOT_MODIFIED = ("etag", "last-modified", "cache-control", "content-security-policy")
 
 SANDBOX = "; ".join((
     "sandbox allow-scripts", "default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'",
@@ -69,7 +70,8 @@ class Download(FileResponse):
         """Send it, or say that the client has it, or that there is no such part."""
         wanted = Headers(scope=scope).get("if-none-match")
         if wanted is not None and _matches(wanted, self.headers["etag"]):
-            kept = {name: self.headers[name] for name in ("etag", "last-modified", "cache-control")}
+            # A browser takes the headers of this answer over into what it has stored: what the file may do, too.
+            kept = {name: self.headers[name] for name in _OF_NOT_MODIFIED if name in self.headers}
             await Response(status_code=304, headers=kept)(scope, receive, send)
             return
         refused: list[Message] = []

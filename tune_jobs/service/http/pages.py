@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable
@@ -12,6 +13,11 @@ from typing import Any, TypeVar
 from policies.errors import SpecError
 
 Item = TypeVar("Item")
+
+MAX_CURSOR = 4_000
+"""Characters of a cursor. Of the longest key and the longest name that a file system has, it takes fewer."""
+_MAX_TEXT = 200
+"""Characters of a text that is sorted by; of a longer one there are so many, and what tells it from others."""
 
 
 def page_of(
@@ -26,7 +32,8 @@ def page_of(
     """Return a page and the cursor of the next one.
 
     Texts come after numbers, and items without a key last, whichever way. A cursor names the last item of its
-    page by key and identity: items that come and go between two pages neither repeat nor hide others.
+    page by key and identity: items that come and go between two pages neither repeat nor hide others. Texts that begin
+    with the same 200 characters are in an order of their own, which is always the same.
 
     Raises:
         SpecError: The cursor is not one of this list.
@@ -47,7 +54,12 @@ def page_of(
 
 def _sortable(value: Any) -> Any:
     # What is no number is neither before nor after any other: sorted by it, pages would leave items out.
-    return None if isinstance(value, float) and math.isnan(value) else value
+    if isinstance(value, float) and math.isnan(value):
+        return None
+    if isinstance(value, str) and len(value) > _MAX_TEXT:
+        # A cursor has the key in it, and why a trial failed takes pages.
+        return value[:_MAX_TEXT] + hashlib.sha256(value.encode("utf-8", "surrogatepass")).hexdigest()
+    return value
 
 
 def _is_after(entry: tuple[Any, str], last: tuple[Any, str], *, descending: bool) -> bool:
@@ -64,12 +76,15 @@ def _place(entry: tuple[Any, str]) -> tuple[bool, Any, str]:
 
 
 def _encoded(last: tuple[Any, str]) -> str:
-    return base64.urlsafe_b64encode(json.dumps(last).encode()).decode().rstrip("=")
+    # Escaped, a letter that is not ASCII would take up to 12 characters.
+    text = json.dumps(last, ensure_ascii=False).encode("utf-8", "surrogatepass")
+    return base64.urlsafe_b64encode(text).decode().rstrip("=")
 
 
 def _decoded(cursor: str) -> tuple[Any, str]:
     try:
-        value, identity = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        text = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)).decode("utf-8", "surrogatepass")
+        value, identity = json.loads(text)
     except (ValueError, binascii.Error, TypeError, RecursionError) as error:
         raise _wrong() from error
     if not isinstance(identity, str) or not (value is None or isinstance(value, str | int | float)):

@@ -13,7 +13,7 @@ from pydantic_core import to_json
 
 from analysis.records import Objective
 from tune_jobs.service.http.caller import TheService
-from tune_jobs.service.http.pages import page_of
+from tune_jobs.service.http.pages import MAX_CURSOR, page_of
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.sweeps.status import SweepStatus
@@ -40,7 +40,7 @@ def statuses(
     service: TheService,
     *,
     limit: Annotated[int, Query(ge=1, le=1_000, description="The most items of a page.")] = 100,
-    cursor: Annotated[str | None, Query(max_length=2_000, description="`next_cursor` of the page before.")] = None,
+    cursor: Annotated[str | None, Query(max_length=MAX_CURSOR, description="`next_cursor` of the page before.")] = None,
 ) -> Response:
     """Return the status of each sweep, by name, as `status` does of one."""
     page, following = page_of(

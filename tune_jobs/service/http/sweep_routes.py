@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 
 from analysis.records import TrialRecord
 from policies.errors import CheckpointError, NotFoundError
-from tune_jobs.service.http.caller import AChanger, ASubmitter, TheService, set_audit_target
+from tune_jobs.service.http.caller import AChanger, ASubmitter, ATurn, TheService, set_audit_target
 from tune_jobs.service.http.models import (
     Change,
     NewSweep,
@@ -18,7 +18,7 @@ from tune_jobs.service.http.models import (
     SweepPage,
     TrialPage,
 )
-from tune_jobs.service.http.pages import page_of
+from tune_jobs.service.http.pages import MAX_CURSOR, page_of
 from tune_jobs.service.http.problems import NotNowError, TooManyError
 from tune_jobs.service.labels import NOTHING
 from tune_jobs.service.problem_documents import problems
@@ -29,15 +29,21 @@ from tune_jobs.sweeps.plain import to_json
 router = APIRouter(prefix="/api/v1", tags=["sweeps"])
 
 Limit = Annotated[int, Query(ge=1, le=1_000, description="The most items of a page.")]
-Cursor = Annotated[str | None, Query(max_length=2_000, description="`next_cursor` of the page before.")]
+Cursor = Annotated[str | None, Query(max_length=MAX_CURSOR, description="`next_cursor` of the page before.")]
 Order = Annotated[Literal["asc", "desc"], Query(description="The order of the sort.")]
 
 
-@router.post("/plans")
-def plan(new: NewSweep, service: TheService, _: ASubmitter) -> Planned:
+@router.post(
+    "/plans",
+    responses=problems({429: "Too many sweeps are being planned, or too many wrong tokens were shown."}),
+)
+def plan(new: NewSweep, service: TheService, turn: ATurn) -> Planned:
     """Validate a sweep and say what would run; nothing is written."""
     spec, made = service.submitter.plan(new.submission())
-    return Planned(spec=spec.model_dump(mode="json"), plan=to_json(made.to_json()))
+    answer = Planned(spec=spec.model_dump(mode="json"), plan=to_json(made.to_json()))
+    # Not when it has been read, for which a client may take its time.
+    turn.end()
+    return answer
 
 
 @router.post(
@@ -45,13 +51,16 @@ def plan(new: NewSweep, service: TheService, _: ASubmitter) -> Planned:
     status_code=201,
     responses={
         200: {"model": Submitted, "description": "The key was used for this before."},
-        **problems({429: "You have as many sweeps that wait or run as you may, or too many wrong tokens were shown."}),
+        **problems(
+            {429: "You have as many sweeps as you may, too many are being planned, or wrong tokens were shown."}
+        ),
     },
 )
 def submit(
     new: NewSweep,
     service: TheService,
     caller: ASubmitter,
+    turn: ATurn,
     *,
     request: Request,
     response: Response,
@@ -67,6 +76,7 @@ def submit(
         key=idempotency_key,
         check_room=lambda: _check_room(service, caller.name),
     )
+    turn.end()
     set_audit_target(request, job.sweep)
     # The request that made it may have been killed before it could say whose the sweep is.
     if is_new or service.labels.of(job.sweep).owner is None:
@@ -150,12 +160,19 @@ def spec(name: str, service: TheService) -> dict[str, Any]:
     return service.statuses.see(name).status.sweep.spec
 
 
-@router.patch("/sweeps/{name}")
+@router.patch("/sweeps/{name}", responses=problems({409: "The priority is to change, and no job of the sweep waits."}))
 def change(name: str, to: Change, service: TheService, _: AChanger) -> SweepSummary:
-    """Change the priority, the note or the tags."""
+    """Change the priority of what waits, the note or the tags."""
     service.statuses.see(name)
     if to.priority is not None:
-        service.queue.set_priority(name, to.priority)
+        if not service.queue.set_priority(name, to.priority):
+            runs = bool(service.queue.jobs("running", sweep=name))
+            raise NotNowError(
+                f"Sweep {name} has no job that waits, and the priority says which of those is next: "
+                f"{'its job runs already' if runs else 'nothing of it is to be run'}.",
+                "Leave the priority out. A job that is added, as by `resume` or `extend`, has that of the last one; "
+                "change it while it waits.",
+            )
         service.supervisor.wake()
     if to.note is not None or to.tags is not None:
         service.labels.change(name, note=to.note, tags=to.tags)

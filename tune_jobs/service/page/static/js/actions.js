@@ -105,8 +105,10 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
       }),
     edit: () => {
       const { note, tags, job } = state();
+      // Only what waits for its turn has one.
+      const waits = job?.state === "waiting";
       inDialog({
-        title: `Note, tags and priority of ${name()}`,
+        title: `${waits ? "Note, tags and priority" : "Note and tags"} of ${name()}`,
         label: "Save",
         fields: [
           { name: "note", label: "Note", type: "textarea", value: note, max: 2000 },
@@ -118,15 +120,19 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
             max: 1000,
             hint: "Separated by commas.",
           },
-          {
-            name: "priority",
-            label: "Priority",
-            type: "number",
-            value: job?.priority ?? 0,
-            min: -100,
-            max: 100,
-            hint: "Higher ones go first among those that wait.",
-          },
+          ...(waits
+            ? [
+                {
+                  name: "priority",
+                  label: "Priority",
+                  type: "number",
+                  value: job.priority,
+                  min: -100,
+                  max: 100,
+                  hint: "Higher ones go first among those that wait.",
+                },
+              ]
+            : []),
         ],
         act: (values) =>
           ask(ofSweep(name()), {
@@ -134,7 +140,7 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
             body: {
               note: values.note,
               tags: tagsOf(values.tags),
-              ...(job && values.priority !== job.priority ? { priority: values.priority } : {}),
+              ...(waits && values.priority !== job.priority ? { priority: values.priority } : {}),
             },
           }),
       });

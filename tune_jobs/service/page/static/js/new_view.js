@@ -11,6 +11,8 @@ import { maySubmit, me } from "./who.js";
 import { lineOfPath } from "./yaml_lines.js";
 
 const PAUSE_MS = 400;
+// When it is asked again after the service had no turn for it.
+const AGAIN_MS = 10_000;
 const DRAFT = "tune-jobs draft";
 const FIRST =
   "env: CartPole-v1\nalgorithm: ppo\n\nspace:\n  lr: {loguniform: [0.0001, 0.01]}\n\nnum_samples: 8\n\nstop:\n  num_env_steps: 50_000\n";
@@ -89,13 +91,21 @@ export function openNew(main, route) {
 
   function changed() {
     sessionStorage.setItem(DRAFT, editor.text);
-    clearTimeout(timer);
-    timer = setTimeout(check, PAUSE_MS);
+    later(PAUSE_MS);
   }
 
+  function later(pauseMs) {
+    clearTimeout(timer);
+    timer = setTimeout(check, pauseMs);
+  }
+
+  // A preset that was changed is named after it, too.
+  const names = () => ({ name: form.elements.name.value.trim() || null, default_name: choice.value || null });
+
   // What is submitted twice by accident is one sweep; what was changed since is another one.
-  form.addEventListener("input", () => {
+  form.addEventListener("input", (event) => {
     key = randomKey();
+    if (event.target === form.elements.name) later(PAUSE_MS);
   });
 
   async function check() {
@@ -106,7 +116,7 @@ export function openNew(main, route) {
     const text = editor.text;
     plan.wait();
     try {
-      const found = await ask("plans", { method: "POST", body: { text }, signal: asked.signal });
+      const found = await ask("plans", { method: "POST", body: { text, ...names() }, signal: asked.signal });
       editor.mark(new Map());
       plan.show(found);
     } catch (error) {
@@ -114,6 +124,7 @@ export function openNew(main, route) {
       const problems = problemsOf(error, text);
       editor.mark(new Map(problems.filter((item) => item.line !== null).map((item) => [item.line, item.text])));
       plan.refuse(problems, error instanceof Refused ? "" : error.hint);
+      if (error.status === 429) later(AGAIN_MS);
     }
   }
 
@@ -169,13 +180,11 @@ export function openNew(main, route) {
     event.preventDefault();
     submit.disabled = true;
     problem.replaceChildren();
-    const { name, priority, tags, note, wait_for_nodes: wait } = form.elements;
+    const { priority, tags, note, wait_for_nodes: wait } = form.elements;
     try {
       const body = {
         text: editor.text,
-        name: name.value.trim() || null,
-        // A preset that was changed is named after it, too.
-        default_name: choice.value || null,
+        ...names(),
         priority: Number(priority.value),
         tags: tagsOf(tags.value),
         note: note.value,
