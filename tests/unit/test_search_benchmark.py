@@ -187,11 +187,18 @@ def test_what_no_point_is_to_blame_for_is_no_failed_training(monkeypatch: pytest
         module.train(TASK, [({"lr": 1e-3, "minibatch_size": 128}, 0)])
 
 
-def test_the_tables_show_means_intervals_and_ranks() -> None:
-    def kept(*values: float) -> dict[str, Any]:
-        runs = [{"scores": [value - 1, value], "best": {}, "test": value - 2} for value in values]
-        return {"date": "2026-11-23", "machine": "a machine", "runs": runs}
+def kept(*values: float) -> dict[str, Any]:
+    runs = [{"scores": [value - 1, value], "best": {}, "test": value - 2} for value in values]
+    return {"date": "2026-11-23", "machine": "a machine", "runs": runs}
 
+
+def test_the_default_is_ranked_beside_random_draws_wherever_both_were_run() -> None:
+    found = {("cartpole-dqn", "random"): kept(1, 2), ("cartpole-dqn", "gp"): kept(5, 1)}
+    text = "\n".join(tables({**found, ("acrobot-dqn", "gp"): kept(5, 5), ("acrobot-dqn", "tpe"): kept(5, 5)}))
+    assert "Mean rank of 2 over 1 task, while tuning: random 1.50, gp 1.50" in text
+
+
+def test_the_tables_show_means_intervals_and_ranks() -> None:
     text = "\n".join(tables({("cartpole-dqn", "random"): kept(1, 2, 3), ("cartpole-dqn", "tpe"): kept(5, 5, 2)}))
     # The t distribution's 97.5 % quantile with 2 degrees of freedom is 4.303; the deviations are 1 and 1.732.
     assert "| cartpole-dqn | 2.0 ± 2.5 (of 3) | 4.0 ± 4.3 (of 3) | 485.7 | 500 | 466.7 | 421.3 |" in text

@@ -12,6 +12,7 @@ from scipy import stats
 from analysis.wording import counted
 from tests.benchmarks.search.runs import METHODS, NUM_RUNS
 from tests.benchmarks.search.tasks import TASKS
+from tune_jobs.spec.sections import AUTO_SEARCH
 
 Kept = Mapping[tuple[str, str], dict[str, Any] | None]
 """What was kept of the runs, by task and method."""
@@ -32,7 +33,8 @@ def tables(kept: Kept) -> Iterator[str]:
     # The more methods, the fewer tasks that all of them have run.
     everywhere = [method for method in methods if all(kept.get((task, method)) for task in tasks)]
     choosing = [method for method in methods if method in METHODS]
-    for some in dict.fromkeys(map(tuple, (everywhere, choosing, methods))):
+    default = [method for method in methods if method in ("random", AUTO_SEARCH)]
+    for some in dict.fromkeys(map(tuple, (default, everywhere, choosing, methods))):
         yield from _ranks(kept, tasks, some)
     yield ""
     yield from _made(kept, tasks, methods)
