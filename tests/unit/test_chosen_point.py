@@ -321,7 +321,7 @@ def test_one_that_is_killed_between_any_two_files_goes_on_and_a_repeated_job_add
     def do(folder: Path) -> list[Any]:
         request = {
             "sweep": str(folder), "verb": "inject", "arguments": {"point": {"lr": 5e-3}}, "address": None,
-            "wait_for_nodes": 0.0,
+            "wait_for_nodes": 0.0, "num_cpus": 2.0,
         }  # fmt: skip
         return list(driver._done(request).trials)
 

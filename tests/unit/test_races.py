@@ -77,7 +77,7 @@ def test_a_job_of_the_service_that_is_repeated_has_one_race(store: SweepStore, t
     def do(folder: Path) -> list[TrialRecord]:
         request = {
             "job": "j-7", "sweep": str(folder), "verb": "replicate", "arguments": {"top": 3, "seeds": 2},
-            "address": None, "wait_for_nodes": 0.0,
+            "address": None, "wait_for_nodes": 0.0, "num_cpus": 2.0,
         }  # fmt: skip
         return list(driver._done(request).trials)
 
