@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pytest
 import torch
+from networks_alone import check_alone
 from numpy.typing import NDArray
 from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 
@@ -388,13 +389,5 @@ def test_what_a_network_computes_does_not_depend_on_its_place_in_the_stack(num_o
     stack.weights.normal_(generator=rng)
     for num_rows in (32, 33, 128):
         x, gradient = (torch.randn(5, num_rows, number, generator=rng) for number in (10, num_outputs))
-        outputs = stack.forward(x)
-        stack.backward(gradient)
-        for place in range(5):
-            one = slice(place, place + 1)
-            alone.weights.copy_(stack.weights[one])
-            assert torch.equal(alone.forward(x[one]), outputs[one])
-            assert torch.equal(alone.evaluate(x[one], 0, 1), outputs[one])
-            alone.backward(gradient[one])
-            assert torch.equal(alone.gradients, stack.gradients[one])
+        outputs = check_alone(stack, alone, x, gradient)
         assert torch.equal(stack.evaluate(x[1:4], 1, 4), outputs[1:4])

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from networks_alone import check_alone
 
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
 from policies.packed.networks import StackedNetworks
@@ -63,11 +64,4 @@ def test_in_whole_cache_lines_the_place_rounds_nothing(
     stack, alone = (StackedNetworks(number, (9, *hidden_sizes, num_outputs), "tanh") for number in (4, 1))
     stack.weights.normal_(generator=rng)
     x, gradient = (torch.randn(4, num_rows, number, generator=rng) for number in (10, num_outputs))
-    outputs = stack.forward(x)
-    stack.backward(gradient)
-    for place in range(4):
-        one = slice(place, place + 1)
-        alone.weights.copy_(stack.weights[one])
-        assert torch.equal(alone.forward(x[one]), outputs[one])
-        alone.backward(gradient[one])
-        assert torch.equal(alone.gradients, stack.gradients[one])
+    check_alone(stack, alone, x, gradient)
