@@ -14,6 +14,7 @@ from analysis.numbering import drawn_index
 from analysis.records import SweepRecord, TrialRecord
 from policies.hyperparams import Hyperparams
 from tune_jobs.plan.points import point_hyperparams
+from tune_jobs.search.history import History
 from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.transitions import begun, with_point
@@ -37,6 +38,7 @@ class PointChooser:
         change: Callable[[str, Callable[[TrialRecord], TrialRecord]], None],
     ) -> None:
         self._spec, self._sweep = spec, sweep
+        self._history = History(spec)
         self._given: set[str] = set()
         self._records = records
         self._change = change
@@ -66,8 +68,9 @@ class PointChooser:
             return
         drawn = drawn_index(point_index, self._sweep.chosen_points)
         point = propose_point(
-            spec, records, drawn, lambda point: self._hyperparams(point, point_index), self._sweep.prior
-        )
+            spec, records, drawn, lambda point: self._hyperparams(point, point_index), self._sweep.prior,
+            history=self._history,
+        )  # fmt: skip
         self._write(point_index, records, point)
 
     def _hyperparams(self, point: Mapping[str, Any], point_index: int) -> Hyperparams:

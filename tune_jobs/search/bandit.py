@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tune_jobs.search.mutation import mutate
+from tune_jobs.search.one_thread import one_thread
 from tune_jobs.search.parts import Parts
 from tune_jobs.spec.domains import Domain, Range
 
@@ -63,6 +64,7 @@ class Next:
     """The points that other trials train with at the same time."""
 
 
+@one_thread()
 def propose(
     coming: Next,
     space: Mapping[str, Domain],

@@ -12,7 +12,9 @@ A point is known to a method by its values, by what became of each of its seeds,
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,11 +42,47 @@ class KnownPoint:
     level: int | None = None
     """The rung at which a scheduler ended it; None: none did."""
 
-    @property
+    @functools.cached_property
     def score(self) -> float | None:
         """The mean over its seeds; None: it has none, or one of them failed."""
         known = [score for score in self.scores if score is not None]
         return sum(known) / len(known) if known and len(known) == len(self.scores) else None
+
+
+class History:
+    """What a search method is told of the trials of a sweep that goes on: looked at anew is only what has changed.
+
+    Args:
+        spec: The sweep.
+    """
+
+    def __init__(self, spec: SweepSpec) -> None:
+        self._spec = spec
+        self._seen: dict[int, tuple[list[TrialRecord], KnownPoint | None]] = {}
+        """By point, its trials as they were when it was looked at, and what they told."""
+
+    def known_points(self, records: Sequence[TrialRecord]) -> list[KnownPoint]:
+        """Return what the trials tell of their points, in the order of the points.
+
+        Args:
+            records: The records of all trials of the sweep, in any order; those that have not changed may be the same
+                objects as before, which saves time.
+        """
+        points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
+        for record in records:
+            if record.has_point:
+                points[record.point_index].append(record)
+        told = (self._told(index, points[index]) for index in sorted(points))
+        return [point for point in told if point is not None]
+
+    def _told(self, index: int, members: list[TrialRecord]) -> KnownPoint | None:
+        seen = self._seen.get(index)
+        # Records are not changed, but replaced.
+        if seen is not None and len(seen[0]) == len(members) and all(map(operator.is_, seen[0], members)):
+            return seen[1]
+        found = _known(self._spec, sorted(members, key=lambda record: record.index))
+        self._seen[index] = members, found
+        return found
 
 
 def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownPoint]:
@@ -54,28 +92,26 @@ def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownP
         spec: The sweep.
         records: The records of all its trials, in any order.
     """
-    points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
-    for record in records:
-        if record.has_point:
-            points[record.point_index].append(record)
-    known = []
-    for index in sorted(points):
-        members = sorted(points[index], key=lambda record: record.index)
-        if outside(spec.space, members[0].point) or all(record.status == "pending" for record in members):
-            continue
-        ended = [record for record in members if record.status in FINISHED]
-        known.append(
-            KnownPoint(
-                point=members[0].point,
-                scores=tuple(map(_score, ended)),
-                env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps) for record in ended),
-                is_running=any(
-                    record.status not in FINISHED for record in members if record.seed_index < spec.seeds_per_point
-                ),
-                level=_level(spec, members),
-            )
-        )
-    return known
+    return History(spec).known_points(records)
+
+
+def _known(spec: SweepSpec, members: Sequence[TrialRecord]) -> KnownPoint | None:
+    """Return what a model is told of a point; None: nothing.
+
+    Args:
+        spec: The sweep.
+        members: The records of its trials that have a point, in their order.
+    """
+    if outside(spec.space, members[0].point) or all(record.status == "pending" for record in members):
+        return None
+    ended = [record for record in members if record.status in FINISHED]
+    return KnownPoint(
+        point=members[0].point,
+        scores=tuple(map(_score, ended)),
+        env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps) for record in ended),
+        is_running=any(record.status not in FINISHED for record in members if record.seed_index < spec.seeds_per_point),
+        level=_level(spec, members),
+    )
 
 
 def _score(record: TrialRecord) -> float | None:

@@ -29,7 +29,8 @@ from analysis.records import PriorRecord, TrialRecord
 from policies import random_streams
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.search.asking import Check, Method, Question
-from tune_jobs.search.history import KnownPoint, known_points
+from tune_jobs.search.history import History, KnownPoint
+from tune_jobs.search.one_thread import one_thread
 from tune_jobs.search.parts import Parts
 from tune_jobs.search.prior import with_prior
 from tune_jobs.search.two_objectives import weighed
@@ -90,6 +91,8 @@ def propose_point(
     drawn_index: int,
     check: Check,
     prior: Sequence[PriorRecord] = (),
+    *,
+    history: History | None = None,
 ) -> dict[str, Any]:
     """Choose the next point of a sweep by its search method.
 
@@ -104,12 +107,13 @@ def propose_point(
         drawn_index: The index of the point to choose, among those that nobody chose.
         check: Raises SpecError for a point whose values contradict each other; then another is proposed.
         prior: What the search began with. Its points count as ended.
+        history: Remembers what the records of this sweep told before, which saves time; None: nothing does.
 
     Raises:
         SpecError: None of many proposals is valid.
         CannotRunError: What the method needs is not installed.
     """
-    known = known_points(spec, records)
+    known = (history or History(spec)).known_points(records)
     if spec.objective.cost is not None:
         known = weighed(known, drawn_index, spec.seed)
     return next_point(
@@ -153,11 +157,12 @@ def next_point(
         return _valid_draw(space, index, seed, check)
     propose, parts = _METHODS[method].load(), Parts(space)
     if parts.are_the_same:
-        return propose(Question(space, known, index, seed), check)
+        with one_thread():
+            return propose(Question(space, known, index, seed), check)
     seen = [replace(item, point=parts.values_of(item.point)) for item in known]
-    return parts.point_of(
-        propose(Question(parts.space, seen, index, seed, parts), lambda values: check(parts.point_of(values)))
-    )
+    question = Question(parts.space, seen, index, seed, parts)
+    with one_thread():
+        return parts.point_of(propose(question, lambda values: check(parts.point_of(values))))
 
 
 def _valid_draw(space: Mapping[str, Domain], index: int, seed: int, check: Check) -> dict[str, Any]:

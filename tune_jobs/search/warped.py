@@ -12,6 +12,7 @@ another order. The scores of the seeds themselves tell how far a mean can be tru
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -47,8 +48,8 @@ def warped(known: Sequence[KnownPoint]) -> Warped:
     Args:
         known: Points that have ended.
     """
-    shares = shares_of(known)
-    table = np.array([rank_of(point) for point in known], dtype=np.float64).reshape(-1, 2)
+    table = _table(known)
+    shares = _shares(table)
     scores = _with_distances(_normal_quantiles(shares), table, shares)
     scores = scores - scores.mean()
     if (deviation := float(scores.std())) > 0:
@@ -62,11 +63,21 @@ def shares_of(known: Sequence[KnownPoint]) -> Floats:
     Args:
         known: As for `warped`.
     """
-    keys = [rank_of(point) for point in known]
-    order = {key: place for place, key in enumerate(sorted(set(keys)))}
-    places = np.array([order[key] for key in keys], dtype=np.int64)
-    counts = np.bincount(places, minlength=len(order))
-    shares: Floats = ((np.cumsum(counts) - counts / 2) / max(1, len(keys)))[places]
+    return _shares(_table(known))
+
+
+def _table(known: Sequence[KnownPoint]) -> Floats:
+    """Return what `rank_of` says of points, shape (num_points, 2)."""
+    return np.fromiter(itertools.chain.from_iterable(map(rank_of, known)), np.float64).reshape(-1, 2)
+
+
+def _shares(table: Floats) -> Floats:
+    order = np.lexsort((table[:, 1], table[:, 0]))
+    ordered = table[order]
+    places = np.empty(len(table), dtype=np.int64)
+    places[order] = np.concatenate([[0], (ordered[1:] != ordered[:-1]).any(axis=1)])[: len(table)].cumsum()
+    counts = np.bincount(places)
+    shares: Floats = ((np.cumsum(counts) - counts / 2) / max(1, len(table)))[places]
     return shares
 
 
