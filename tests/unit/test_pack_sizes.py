@@ -67,6 +67,23 @@ def test_few_trials_run_at_once_where_a_model_learns_from_those_that_ended(
     assert packs(cpus, **{**TPE, "resources": {"max_concurrent": 1}}) == (1, 1)
 
 
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"num_samples": 49}, (2, 2)),
+        ({"num_samples": 100}, (2, 5)),
+        ({"num_samples": 32, "seeds_per_point": 3}, (2, 4)),
+        ({"num_samples": 1_000}, (2, 50)),
+        ({"num_samples": 10_000}, (2, 64)),
+        ({"num_samples": 100, "resources": {"max_concurrent": 6}}, (2, 3)),
+    ],
+)
+def test_a_tenth_of_many_trials_run_at_once_where_a_model_learns(
+    fields: dict[str, Any], expected: tuple[int, int]
+) -> None:
+    assert packs(**{**TPE, **fields}) == expected
+
+
 # -- memory
 
 # Observations of 4 numbers, before and after, action, reward, discount: 48 bytes a transition.

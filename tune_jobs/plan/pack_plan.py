@@ -17,13 +17,14 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 MAX_SLOTS = 64
 """The most trials that one pack trains at once."""
 
-MAX_AT_ONCE_BY_MODEL = 4
-"""How many trials run at once where a model chooses the points, if there are not more CPUs.
+AT_ONCE_BY_MODEL = 4
+"""How many trials run at once where a model chooses the points, if there are neither more CPUs nor many trials.
 
 The model learns from trials that have ended; about running trials it knows only that they run. A pack that trains
-dozens at once would begin most points of a sweep before the model has any results, which would be random search. With
-few at once, the sweep takes longer, but its proposals are better informed.
+dozens at once would begin most points of a small sweep before the model has any results, which would be random search.
 """
+SHARE_AT_ONCE_BY_MODEL = 0.1
+"""Of a sweep's trials, those that run at once if these are more: with so few, what is found is as good (decision 40)."""
 
 # The other half is for the processes themselves, for other programs, and for what the estimate leaves out.
 SHARE_OF_MEMORY = 0.5
@@ -83,7 +84,8 @@ def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, in
     """Return how many packs and slots CPUs, GPUs and the limits on trials at once allow."""
     limit = math.inf if spec.resources.max_concurrent is None else spec.resources.max_concurrent
     if spec.search.has_model:
-        limit = min(limit, max(MAX_AT_ONCE_BY_MODEL, fitting))
+        share = int(SHARE_AT_ONCE_BY_MODEL * spec.num_samples * spec.seeds_per_point)
+        limit = min(limit, max(AT_ONCE_BY_MODEL, share, fitting))
     num_packs = max(1, int(min(fitting, num_members, limit)))
     share = math.ceil(num_members / num_packs)
     # Trials run in several rounds of equal size, so that the last ones are not left to one pack.

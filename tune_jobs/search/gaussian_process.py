@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 _SQRT5 = math.sqrt(5.0)
 _JITTER = 1e-6
+_NEARLY_THE_SAME = 1e-4
+"""Of the function's variance, what stays unknown at a point that was tried."""
 
 
 @dataclass(frozen=True)
@@ -121,14 +123,18 @@ def _loss(logs: Floats, observed: Observed, squares: Floats, expected: Floats, w
 class Posterior:
     """What a process says of any point, after observations.
 
+    What it expects takes the scores for as noisy as they are. How far off that may be is told as if there were no
+    noise: then nothing is to be gained where a point was tried, whatever its scores, and a search goes on to other
+    places ("re-interpolation": Forrester et al. 2006, "Design and Analysis of 'Noisy' Computer Experiments"). With the
+    noise in it, the search stays around the luckiest score (decision 40).
+
     Args:
         settings: The settings of the process.
         group_of_column: Which columns have one length scale, from 0.
         observed: What was seen.
         awaited: Points whose scores are not known yet, shape (any, num_columns). They make the process surer of their
             surroundings, but don't change what it expects there (Desautels et al. 2014, "Parallelizing Exploration-
-            Exploitation Tradeoffs with Gaussian Process Bandit Optimization"); as if they were to be known without
-            noise, so that no other is proposed right beside one.
+            Exploitation Tradeoffs with Gaussian Process Bandit Optimization").
     """
 
     def __init__(
@@ -138,12 +144,13 @@ class Posterior:
         self._by_length = 1.0 / settings.length_scales[group_of_column]
         self._num_observed = len(observed.means)
         self._seen = np.concatenate([observed.columns, awaited]) * self._by_length
-        noise = np.concatenate([settings.noise / observed.counts, np.zeros(len(awaited))])
-        kernel = self._kernel(self._seen, self._seen) + np.diag(noise + _JITTER)
-        self._inverse = np.linalg.inv(np.linalg.cholesky(kernel))
-        # Without what is awaited it is the upper left part.
-        first = self._inverse[: self._num_observed, : self._num_observed]
-        self._alpha = first.T @ (first @ observed.means)
+        kernel = self._kernel(self._seen, self._seen)
+        first = kernel[: self._num_observed, : self._num_observed] + np.diag(settings.noise / observed.counts + _JITTER)
+        inverse = np.linalg.inv(np.linalg.cholesky(first))
+        self._alpha = inverse.T @ (inverse @ observed.means)
+        # Places that are nearly the same would make the matrix singular.
+        apart = _NEARLY_THE_SAME * settings.scale * np.eye(len(kernel))
+        self._inverse = np.linalg.inv(np.linalg.cholesky(kernel + apart))
 
     def _kernel(self, left: Floats, right: Floats) -> Floats:
         squares = (left**2).sum(1)[:, None] + (right**2).sum(1)[None, :] - 2.0 * (left @ right.T)
@@ -157,7 +164,7 @@ class Posterior:
         return expected
 
     def at(self, columns: Floats) -> tuple[Floats, Floats]:
-        """Return mean and standard deviation of the function at points, each of shape (num_points,)."""
+        """Return what is expected of points and how far off that may be, as deviation, each of shape (num_points,)."""
         kernel = self._kernel(columns * self._by_length, self._seen)
         mean = kernel[:, : self._num_observed] @ self._alpha
         variance = self._settings.scale - ((kernel @ self._inverse.T) ** 2).sum(1)
