@@ -24,7 +24,7 @@ The model learns from trials that have ended; about running trials it knows only
 dozens at once would begin most points of a small sweep before the model has any results, which would be random search.
 """
 SHARE_AT_ONCE_BY_MODEL = 0.1
-"""Of a sweep's trials, those that run at once if these are more: with so few, what is found is as good (decision 40)."""
+"""Of a sweep's trials, those that run at once if these are more: what is found is as good (decision 40)."""
 
 # The other half is for the processes themselves, for other programs, and for what the estimate leaves out.
 SHARE_OF_MEMORY = 0.5
