@@ -37,6 +37,16 @@ def guard() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _scratch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is fetched from object stores, which stays for the next command: a thousand folders after a run of tests."""
+    from tune_jobs.store.objects.scratch import VARIABLE
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, str(tmp_path_factory.mktemp("scratch")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _no_source_is_looked_up() -> Iterator[None]:
     """Ray 2.60's `ConnectorV2.__init__` asks for the frame of its caller, and gets the source of all frames read.
 
