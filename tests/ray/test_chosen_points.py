@@ -11,6 +11,7 @@ from analysis.records import PriorRecord, TrialRecord
 from tests.narrowing import present
 from tune_jobs.ray_tune import searcher
 from tune_jobs.search.asking import Check
+from tune_jobs.search.history import History
 from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
@@ -69,10 +70,11 @@ def test_tpe_goes_on_behind_it_with_its_own_draws_and_is_told_of_it(
     told: list[tuple[int, list[str]]] = []
 
     def watched(
-        spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check, prior: Sequence[PriorRecord]
-    ) -> dict[str, Any]:
+        spec: SweepSpec, records: Sequence[TrialRecord], drawn_index: int, check: Check, prior: Sequence[PriorRecord],
+        *, history: History,
+    ) -> dict[str, Any]:  # fmt: skip
         told.append((drawn_index, [record.trial_id for record in records if record.status == "completed"]))
-        return propose_point(spec, records, drawn_index, check, prior)
+        return propose_point(spec, records, drawn_index, check, prior, history=history)
 
     monkeypatch.setattr(searcher, "propose_point", watched)
     launch(tmp_path, given)

@@ -10,6 +10,7 @@ import pytest
 from analysis.records import ChosenPointRecord, PriorRecord, SweepRecord, TrialRecord
 from tune_jobs.ray_tune import searcher
 from tune_jobs.ray_tune.searcher import PointChooser
+from tune_jobs.search.history import History
 from tune_jobs.spec.file import load_spec
 
 pytestmark = pytest.mark.ray
@@ -33,6 +34,7 @@ class Sweep:
             )
             for index in range(8)
         }  # fmt: skip
+        self.histories: list[History] = []
         self.asked: list[tuple[dict[str, str], int, Any]] = []
         prior = PriorRecord(sweep="before", env_id="CartPole-v1", points=())
         record = SweepRecord(
@@ -41,8 +43,10 @@ class Sweep:
         )  # fmt: skip
 
         def propose(
-            spec: Any, records: Sequence[TrialRecord], drawn_index: int, check: Callable[[Any], Any], prior: Any
-        ) -> dict[str, Any]:
+            spec: Any, records: Sequence[TrialRecord], drawn_index: int, check: Callable[[Any], Any], prior: Any,
+            *, history: History,
+        ) -> dict[str, Any]:  # fmt: skip
+            self.histories.append(history)
             self.asked.append(({item.trial_id: item.status for item in records}, drawn_index, prior))
             point = {"lr": 1e-3 * (1 + len(self.asked))}
             check(point)
@@ -91,6 +95,14 @@ def test_a_driver_killed_between_two_seeds_of_a_point_leaves_it_one_point(monkey
     assert len(sweep.asked) == 1
     assert sweep.point(1) == sweep.point(0)
     assert sweep.records["t0001"].hyperparams == sweep.records["t0000"].hyperparams
+
+
+def test_what_the_records_told_is_remembered_from_choice_to_choice(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = Sweep(monkeypatch)
+    for name in ("t0000", "t0002", "t0004"):
+        sweep.chooser.prepare(name)
+    assert len(sweep.histories) == 3
+    assert len(set(map(id, sweep.histories))) == 1
 
 
 def test_points_that_somebody_chose_take_no_random_numbers_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
