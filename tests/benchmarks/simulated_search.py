@@ -1,9 +1,9 @@
 """What search methods find on made-up tasks that are as skewed and noisy as returns are; no training, some minutes.
 
-`python -m tests.benchmarks.simulated_search [METHOD,...] [--runs 20] [--at-once 1] [--seeds 3]` prints the table of
-decision 40. A run is a budget of 96 trials, 32 points of 3 seeds; a task's best place is drawn for each run. It counts
-what the point is worth that a person would take, the one with the best mean over its seeds: the mean of 1,000 fresh
-trials of it, as a share of the way from the median of random points to the best place.
+`python -m tests.benchmarks.simulated_search [METHOD,...] [--runs 20] [--at-once 1] [--seeds 3] [--trials 96]` prints
+the table of decision 40. A run is a budget of trials, by default 32 points of 3 seeds; a task's best place is drawn for
+each run. It counts what the point is worth that a person would take, the one with the best mean over its seeds: the
+mean of 1,000 fresh trials of it, as a share of the way from the median of random points to the best place.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_point
 
 Floats = NDArray[np.float64]
-NUM_TRIALS = 96
 PPO: dict[str, Any] = {
     "lr": {"loguniform": [1e-6, 0.1]}, "entropy_coeff": {"uniform": [0, 0.5]}, "gae_lambda": {"uniform": [0.8, 0.9999]},
     "clip_param": {"uniform": [0.01, 0.5]}, "vf_clip_param": {"uniform": [0.01, 0.5]},
@@ -142,12 +141,12 @@ def worth_of(scores: Floats) -> float:
     return float(np.where(np.isnan(scores), np.nanmin(scores), scores).mean())
 
 
-def found_by(method: str, name: str, run: int, *, seeds: int, at_once: int) -> tuple[float, float]:
+def found_by(method: str, name: str, run: int, *, trials: int, seeds: int, at_once: int) -> tuple[float, float]:
     """Return what a method found in a run, from 0, a random point, to 1, the best; and the seconds that it took."""
     task, rng = Task(name, run), np.random.default_rng([run, 7])
     known: list[KnownPoint] = []
     seconds = 0.0
-    for index in range(NUM_TRIALS // seeds):
+    for index in range(trials // seeds):
         shown = [
             KnownPoint(item.point, is_running=True) if place > index - at_once else item
             for place, item in enumerate(known)
@@ -164,9 +163,9 @@ def found_by(method: str, name: str, run: int, *, seeds: int, at_once: int) -> t
     return max(-1.0, (worth - low) / (high - low)), seconds
 
 
-def _one(job: tuple[str, str, int, int, int]) -> tuple[float, float]:
-    method, name, run, seeds, at_once = job
-    return found_by(method, name, run, seeds=seeds, at_once=at_once)
+def _one(job: tuple[str, str, int, int, int, int]) -> tuple[float, float]:
+    method, name, run, trials, seeds, at_once = job
+    return found_by(method, name, run, trials=trials, seeds=seeds, at_once=at_once)
 
 
 def _ranks(found: Floats) -> Floats:
@@ -182,13 +181,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("methods", nargs="?", default="random,tpe,gp,forest")
     parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--trials", type=int, default=96)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--at-once", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args(arguments)
     methods = given.methods.split(",")
     jobs = [
-        (method, name, run, given.seeds, given.at_once)
+        (method, name, run, given.trials, given.seeds, given.at_once)
         for method in methods for name in TASKS for run in range(given.runs)
     ]  # fmt: skip
     with ProcessPoolExecutor(given.processes) as pool:
@@ -201,7 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for index, method in enumerate(methods):
         cells = [f"{value:.2f}" for value in found[index].mean(1)]
         error = ranks[index].std() / np.sqrt(ranks[index].size)
-        a_point = 1e3 * seconds[index].mean() / (NUM_TRIALS // given.seeds)
+        a_point = 1e3 * seconds[index].mean() / (given.trials // given.seeds)
         print(
             f"| {method} |", " | ".join(cells),
             f"| {found[index].mean():.3f} | {ranks[index].mean():.2f} ± {error:.2f} | {a_point:.1f} |",

@@ -84,8 +84,8 @@ def _by_cpus(spec: SweepSpec, fitting: float, num_members: int) -> tuple[int, in
     """Return how many packs and slots CPUs, GPUs and the limits on trials at once allow."""
     limit = math.inf if spec.resources.max_concurrent is None else spec.resources.max_concurrent
     if spec.search.has_model:
-        share = int(SHARE_AT_ONCE_BY_MODEL * spec.num_samples * spec.seeds_per_point)
-        limit = min(limit, max(AT_ONCE_BY_MODEL, share, fitting))
+        tenth = int(SHARE_AT_ONCE_BY_MODEL * spec.num_samples * spec.seeds_per_point)
+        limit = min(limit, max(AT_ONCE_BY_MODEL, tenth, fitting))
     num_packs = max(1, int(min(fitting, num_members, limit)))
     share = math.ceil(num_members / num_packs)
     # Trials run in several rounds of equal size, so that the last ones are not left to one pack.

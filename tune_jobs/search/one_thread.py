@@ -1,8 +1,8 @@
 """Let models compute with one thread, as trials train on the cores and the models' matrices are small.
 
-NumPy's OpenBLAS has a thread a core, which wait for each other by turning round and round. Where every core trains a
-pack, a point that takes 16 ms took up to a second, and time from the packs. With one thread the sums are also formed in
-the same order on every machine.
+NumPy's OpenBLAS has a thread a core, which spin while they wait for each other. Where every core trains a pack, one
+choice in ten took over 180 ms, and CPU time from the packs; with one thread, 24 ms. The sums are then also formed in an
+order that does not depend on the number of cores.
 """
 
 from __future__ import annotations
