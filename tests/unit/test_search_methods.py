@@ -173,9 +173,11 @@ def test_a_point_of_several_seeds_counts_by_their_mean_once_all_have_ended(metho
     def proposed(other_seed: dict[str, Any]) -> np.float64:
         records = []
         for index, lr in enumerate(map(float, np.linspace(0.02, 0.98, 24))):
-            second: dict[str, Any] = {"score": 1.0} if lr < 0.5 else other_seed
+            # Where all that ended are equal, points are random.
+            low = 1.0 + 0.01 * (index % 2)
+            second: dict[str, Any] = {"score": low} if lr < 0.5 else other_seed
             records += [
-                record(2 * index, {"lr": lr}, 1.0 if lr < 0.5 else 5.0, point_index=index),
+                record(2 * index, {"lr": lr}, low if lr < 0.5 else 5.0, point_index=index),
                 record(2 * index + 1, {"lr": lr}, point_index=index, **second),
             ]
         return cast(
@@ -242,6 +244,35 @@ def test_a_proposal_whose_values_do_not_go_together_is_replaced(method: str) -> 
 
     with pytest.raises(SpecError, match="never"):
         propose_point(spec, records, 5, refuse)
+
+
+@each_method
+def test_as_long_as_all_are_equally_good_points_are_random(method: str) -> None:
+    """A model would know but where they are, and go to the corners of the space."""
+    spec = make_spec(method=method, startup=4)
+
+    def ended(count: int, score: float | None) -> list[TrialRecord]:
+        return [record(index, draw_point(spec.space, index, spec.seed), score) for index in range(count)]
+
+    def proposed(records: Sequence[TrialRecord]) -> dict[str, Any]:
+        return propose_point(spec, records, len(records), lambda point: None)
+
+    drawn = draw_point(spec.space, 20, spec.seed)
+    assert proposed(ended(20, -200.0)) == drawn
+    assert proposed(ended(20, None)) == drawn
+    one_better = [*ended(19, -200.0), record(19, draw_point(spec.space, 19, spec.seed), -150.0)]
+    assert proposed(one_better) != drawn
+    # What runs tells nothing yet.
+    running = record(19, draw_point(spec.space, 19, spec.seed), -150.0, status="running")
+    assert proposed([*ended(19, -200.0), running]) == drawn
+
+
+@each_method
+def test_as_long_as_all_are_equally_good_no_point_is_tried_twice(method: str) -> None:
+    spec = make_spec(method=method, startup=1, num_samples=8, space={"activation": {"choice": ["tanh", "relu", "silu"]}})
+    points = [point["activation"] for point in search(spec, lambda point: 1.0)]
+    assert sorted(points[:3]) == ["relu", "silu", "tanh"]
+    assert len(points) == 8
 
 
 @each_method

@@ -151,7 +151,7 @@ def test_a_method_is_asked_of_whole_points_and_its_answer_is_stripped(monkeypatc
             return propose
 
     monkeypatch.setitem(proposal._METHODS, "fake", Fake("fake"))
-    known = [KnownPoint({"replay": "uniform", "hidden_sizes": [64]}, scores=(1.0,))]
+    known = [KnownPoint({"replay": "uniform", "hidden_sizes": [64]}, scores=(score,)) for score in (1.0, 2.0)]
     point = proposal.next_point("fake", SPACE, known, 1, seed=0, num_startup_trials=1, check=checked.append)
     assert point == {"replay": "uniform", "hidden_sizes": [64]} == checked[0]
     assert asked[0].known[0].point.keys() == asked[0].space.keys() == Parts(SPACE).space.keys()

@@ -20,8 +20,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,6 +33,7 @@ from tune_jobs.search.one_thread import one_thread
 from tune_jobs.search.parts import Parts
 from tune_jobs.search.prior import with_prior
 from tune_jobs.search.two_objectives import weighed
+from tune_jobs.search.warped import rank_of
 from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_point
@@ -98,8 +98,9 @@ def propose_point(
 
     Where the sweep asks for score and cost, the methods are told of both (`two_objectives`).
 
-    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, the point
-    is the random one of its index, or another random one where its values contradict each other.
+    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, or all
+    that have are equally good, the point is the random one of its index, or another random one where its values
+    contradict each other.
 
     Args:
         spec: The sweep.
@@ -140,7 +141,8 @@ def next_point(
         known: What was tried before, in order, and what is being tried.
         index: The index of the point, from 0: its random numbers belong to it.
         seed: At least 0; the same seed, index and known points give the same point.
-        num_startup_trials: How many points have to end before a model proposes points; until then they are random.
+        num_startup_trials: How many points have to end before a model proposes points; until then they are random, and
+            as long as all that ended are equally good.
         check: Raises SpecError for a point whose values contradict each other; then another is proposed, except by
             `random`, whose points are all known and checked before.
 
@@ -150,11 +152,12 @@ def next_point(
         KeyError: There is no such method.
     """
     check_installed(method)
-    is_too_early = sum(not point.is_running for point in known) < num_startup_trials
     if method == "random":
         return draw_point(space, index, seed)
-    if is_too_early:
+    if sum(not point.is_running for point in known) < num_startup_trials:
         return _valid_draw(space, index, seed, check)
+    if _are_all_equal(known):
+        return _new_draw(space, known, index, seed, check)
     propose, parts = _METHODS[method].load(), Parts(space)
     if parts.are_the_same:
         with one_thread():
@@ -165,19 +168,54 @@ def next_point(
         return parts.point_of(propose(question, lambda values: check(parts.point_of(values))))
 
 
+def _are_all_equal(known: Sequence[KnownPoint]) -> bool:
+    """Return whether nothing tells points that ended apart.
+
+    A model of them knows but where they are. It would go where they are not, and most of such places are in corners of
+    the space, while what is to be found is usually in none (decision 40).
+    """
+    ended = (rank_of(point) for point in known if not point.is_running)
+    first = next(ended, None)
+    return all(rank == first for rank in ended)
+
+
 def _valid_draw(space: Mapping[str, Domain], index: int, seed: int, check: Check) -> dict[str, Any]:
     """Return the random point of an index, or the next of its stream whose values go together.
 
     Of those that are asked for while the first ones still run, no plan has looked at any.
     """
-    point, rng = draw_point(space, index, seed), random_streams.model_draws(seed, index)
-    for number in itertools.count(1):
+    for number, point in enumerate(_draws(space, index, seed), start=1):
         try:
             check(point)
         except SpecError:
             if number == _NUM_DRAWN:
                 raise
-            point = Conditions(space).stripped({name: domain.sample(rng) for name, domain in space.items()})
         else:
-            break
-    return point
+            return point
+    raise AssertionError("draws never end")
+
+
+def _new_draw(
+    space: Mapping[str, Domain], known: Sequence[KnownPoint], index: int, seed: int, check: Check
+) -> dict[str, Any]:
+    """Return the random point of an index, or the next of its stream that is valid and was not tried before."""
+    tried = [item.point for item in known]
+
+    def check_new(point: dict[str, Any]) -> None:
+        check(point)
+        if point in tried:
+            raise SpecError("It was tried before.")
+
+    try:
+        return _valid_draw(space, index, seed, check_new)
+    except SpecError:
+        # A space may have no other.
+        return _valid_draw(space, index, seed, check)
+
+
+def _draws(space: Mapping[str, Domain], index: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Yield the random point of an index, and others of its stream without end."""
+    yield draw_point(space, index, seed)
+    rng = random_streams.model_draws(seed, index)
+    while True:
+        yield Conditions(space).stripped({name: domain.sample(rng) for name, domain in space.items()})
