@@ -133,7 +133,7 @@ class SearchSpec(Section):
     num_startup_trials: PositiveWhole = Field(
         10,
         description="gp, forest, tpe: how many points have to end before the model proposes points; until then they "
-        "are random.",
+        "are random, and as long as all that ended are equally good.",
     )
 
     @property
