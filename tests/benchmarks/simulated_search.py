@@ -128,6 +128,7 @@ class Task:
         for side, parts in enumerate(self._cube.num_unordered):
             if parts:
                 best[side] = (np.argmin(self._losses[side]) + 0.5) / parts
+        best[0] = np.clip(best[0] + self._slope * (best[self._other] - self._best[self._other]), 0.0, 1.0)
         rng = np.random.default_rng(0)
         points = [draw_point(self.space, index, 1_000_000) for index in range(200)]
         worth = [worth_of(self.scores(point, rng, 100)) for point in points]

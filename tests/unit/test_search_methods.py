@@ -269,7 +269,9 @@ def test_as_long_as_all_are_equally_good_points_are_random(method: str) -> None:
 
 @each_method
 def test_as_long_as_all_are_equally_good_no_point_is_tried_twice(method: str) -> None:
-    spec = make_spec(method=method, startup=1, num_samples=8, space={"activation": {"choice": ["tanh", "relu", "silu"]}})
+    spec = make_spec(
+        method=method, startup=1, num_samples=8, space={"activation": {"choice": ["tanh", "relu", "silu"]}}
+    )
     points = [point["activation"] for point in search(spec, lambda point: 1.0)]
     assert sorted(points[:3]) == ["relu", "silu", "tanh"]
     assert len(points) == 8
