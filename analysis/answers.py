@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
+from typing import Literal
 
-from analysis.best_records import SettingsRecord
+from analysis.best_records import BestRecord, SettingsRecord
 from analysis.records import Objective, SweepRecord, TrialRecord
 from analysis.wording import counted, return_text
 
@@ -44,6 +46,45 @@ def certainty(settings: SettingsRecord) -> str:
     if others <= 0:
         return f"{text}; the data tell it from all others"
     return f"{text}; {counted(others, 'other')} can't be told from it"
+
+
+def compared_with_random(best: BestRecord) -> Literal["better", "alike", "worse"] | None:
+    """Return how the winner does beside random play, by the 95 % t-interval of the mean difference over episodes.
+
+    Args:
+        best: The winner, with its confirmation and random play on the same seeds.
+
+    Returns:
+        "alike" where the interval holds 0; None: it is not known, as returns are not finite, or of one episode alone.
+    """
+    if best.random.seeds != best.confirmation.seeds or best.confirmation.num_episodes < 2:
+        return None
+    gains = [ours - theirs for ours, theirs in zip(best.confirmation.returns, best.random.returns, strict=True)]
+    number = len(gains)
+    mean = sum(gains) / number
+    deviation = math.hypot(*((gain - mean) / math.sqrt(number - 1) for gain in gains))
+    if not math.isfinite(deviation):
+        return None
+    from analysis.statistics.student_t import t_quantile
+
+    half = t_quantile(0.975, number - 1) * deviation / math.sqrt(number)
+    if mean - half > 0:
+        return "better"
+    return "worse" if mean + half < 0 else "alike"
+
+
+def nothing_learned(best: BestRecord) -> str:
+    """Say, as a sentence, that training has not led beyond random play, and what to do; empty: it has, as far as known.
+
+    Args:
+        best: The winner of a sweep whose policies learn.
+    """
+    told = {"alike": "can't be told from", "worse": "is worse than"}.get(compared_with_random(best) or "")
+    if told is None:
+        return ""
+    episodes = counted(best.confirmation.num_episodes, "episode")
+    advice = "train longer (stop.num_env_steps), or search other values"
+    return f"The best policy {told} random play over {episodes}: {advice}."
 
 
 def replicas_text(sweep: SweepRecord, trials: Sequence[TrialRecord]) -> str:

@@ -76,6 +76,22 @@ def test_one_seed_a_setting_names_no_setting() -> None:
     assert found.command == "tune-jobs replicate sweep"
 
 
+def test_where_all_with_one_seed_are_alike_nobody_did_best() -> None:
+    synthetic = make_sweep(points=[{"lr": 3e-3}, {"lr": 3.1e-3}, {"lr": 1e-7}])
+    synthetic.trials[:] = [
+        trial.model_copy(
+            update={"checkpoints": tuple(c.model_copy(update={"evaluation_return": 9.0}) for c in trial.checkpoints)}
+        )
+        for trial in synthetic.trials
+    ]
+    alike = [
+        setting(index, [f"t000{index}"], 0).model_copy(update={"score": 9.0, "scores": (9.0,)}) for index in range(3)
+    ]
+    found = answer.section(source_of(synthetic, settings_of(*alike, num_settings=24)))
+    assert found.sentences[0].endswith("not a good setting; 3 of 3 trials tie at 9.0.")
+    assert "did best" not in " ".join(found.sentences)
+
+
 def test_the_policy_and_the_setting_are_not_mixed(fast_and_slow: Synthetic) -> None:
     best = present(fast_and_slow.best)
     winner = best.checkpoint.trial_id

@@ -169,9 +169,17 @@ def _print_best(console: Console, best: BestRecord) -> None:
         "policy": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
         **_chosen(best),
         "confirmed at": f"{_returns(best.confirmation)}; gap {difference_text(best.optimism_gap)}",
-        "random policy": _returns(best.random),
+        "random policy": f"{_returns(best.random)}{_beside_random(best)}",
     }
     print_facts(console, facts | _verdict(best.confirmation) | _setting_facts(best.settings))
+
+
+def _beside_random(best: BestRecord) -> str:
+    """Return what is to be said of a winner that is no better; empty: it is, or that is not known."""
+    from analysis.answers import compared_with_random
+
+    told = {"alike": "; the policy can't be told from it", "worse": "; the policy is worse"}
+    return told.get(compared_with_random(best) or "", "")
 
 
 def _chosen(best: BestRecord) -> dict[str, str]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from analysis.objectives import SettingScores, reached_goal
 from analysis.racing import Race, race_within
-from analysis.records import ReplicationRecord, SweepRecord, TrialRecord
+from analysis.records import IterationRecord, ReplicationRecord, SweepRecord, TrialRecord
 from policies.portable.file import BASELINE_KINDS
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -46,10 +46,24 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
         trials, results = read_trials(store), read_results(store)
     before = trials_before(trials, rounds)
     race = confirming_race(spec, different_points(ranked(spec, before, results, threshold)), before)
-    if race is None:
+    if race is None or are_all_alike([line for trial in before for line in results.get(trial.trial_id, ())]):
         return ()
     scores = {item.point_index: item.scores for item in ranked(spec, trials, results, threshold)}
     return race.next_points(scores, len(rounds))
+
+
+def are_all_alike(results: Sequence[IterationRecord]) -> bool:
+    """Whether trials were evaluated and all episodes of all of them, those of training too, had the same return.
+
+    That is how it looks where nothing was learned, as on MountainCar in too short a training: no setting leads, and to
+    train some of them again would cost up to half as much as the search and decide nothing.
+
+    Args:
+        results: Of all trials of the search.
+    """
+    evaluated = {line.evaluation_return for line in results if line.evaluation_return is not None}
+    trained = {value for line in results for value in line.episode_returns}
+    return bool(evaluated) and len(evaluated | trained) == 1
 
 
 def different_points(settings: Sequence[SettingScores]) -> list[int]:

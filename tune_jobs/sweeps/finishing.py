@@ -80,6 +80,7 @@ class _Finish:
         except TuneJobsError as error:
             self._why = error
         self.failed = self._why is not None
+        self._compare_with_random()
         if self.best is not None and not kept:
             self._films_and_report(self.best)
             return
@@ -93,6 +94,14 @@ class _Finish:
             self.artifacts["report"] = page
         else:
             self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
+
+    def _compare_with_random(self) -> None:
+        """Note it where training has not led beyond random play: all else is said in the tone of a result."""
+        from analysis.answers import nothing_learned
+        from analysis.report_data import is_trained
+
+        if self.best is not None and is_trained(self._store.read_record()) and (told := nothing_learned(self.best)):
+            self.notes.append(told)
 
     def _films_and_report(self, best: BestRecord) -> None:
         """Film the winner, and draw the report meanwhile."""
