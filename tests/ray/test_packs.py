@@ -285,7 +285,8 @@ def test_points_are_chosen_when_trials_are_handed_to_packs(tmp_path: Path) -> No
     store = make_sweep(tmp_path / "mine", 8, search={"type": "tpe", "num_startup_trials": 2})
     for record in store.read_trials():
         store.trial(record.trial_id).write_record(record.model_copy(update={"has_point": False}))
-    records = run_packs(store, slots=2)
+    # Where all are equally good, points are random.
+    records = run_packs(store, {f"t{index:04d}": {"score": 10.0 + index} for index in range(8)}, slots=2)
     assert [record.status for record in records] == ["completed"] * 8
     assert all(record.has_point and record.hyperparams["lr"] == record.point["lr"] for record in records)
     from tune_jobs.spec.draws import draw_point
