@@ -22,6 +22,12 @@ SMALL: dict[str, Any] = {"hidden_sizes": (4,), "learning_starts": 0, "train_batc
 LATE = {"epsilon_start": 100, "epsilon_decay": 200.0}
 
 
+@pytest.fixture(autouse=True)
+def _logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Stable-Baselines3 makes a folder for each model, of which nobody would take it away.
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
+
+
 def for_sb3(values: TrainedHyperparams, num_env_steps: int = 10_000) -> ForeignProgram:
     return stable_baselines3_program(values, env_id="CartPole-v1", env_args={}, num_env_steps=num_env_steps)
 
