@@ -60,17 +60,14 @@ def compared_with_random(best: BestRecord) -> Literal["better", "alike", "worse"
     if best.random.seeds != best.confirmation.seeds or best.confirmation.num_episodes < 2:
         return None
     gains = [ours - theirs for ours, theirs in zip(best.confirmation.returns, best.random.returns, strict=True)]
-    number = len(gains)
-    mean = sum(gains) / number
-    deviation = math.hypot(*((gain - mean) / math.sqrt(number - 1) for gain in gains))
-    if not math.isfinite(deviation):
+    if not all(map(math.isfinite, gains)):
         return None
-    from analysis.statistics.student_t import t_quantile
+    from analysis.statistics import t_interval
 
-    half = t_quantile(0.975, number - 1) * deviation / math.sqrt(number)
-    if mean - half > 0:
+    gain = t_interval(gains)
+    if gain.lower > 0:
         return "better"
-    return "worse" if mean + half < 0 else "alike"
+    return "worse" if gain.upper < 0 else "alike"
 
 
 def nothing_learned(best: BestRecord) -> str:

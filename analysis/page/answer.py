@@ -6,7 +6,7 @@ import math
 import shlex
 from dataclasses import dataclass
 
-from analysis.answers import certainty, nothing_learned, setting_score
+from analysis.answers import certainty, setting_score
 from analysis.best_records import EvaluationRecord, SettingRecord, SettingsRecord
 from analysis.page.estimates import replicate_takes
 from analysis.page.scores import score_text
@@ -43,9 +43,9 @@ def section(source: Source) -> Answer:
     sentences = [*_progress(source), *_about_setting(source), *_about_policy(source)]
     # Of one setting there is nothing to decide; a sweep that goes on decides more by itself.
     open_question = settings is not None and settings.num_settings > 1 and settings.num_may_be_best > 1
-    if source.is_trained and source.best is not None and (told := nothing_learned(source.best)):
+    if source.nothing_learned:
         # More seeds of settings that have led nowhere would decide nothing.
-        return Answer([told, *sentences])
+        return Answer([source.nothing_learned, *sentences])
     if not open_question or not source.is_trained or source.is_population:
         return Answer(sentences)
     return Answer(sentences, replicate_command(source), replicate_takes(source))

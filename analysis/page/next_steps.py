@@ -56,7 +56,8 @@ def _commands(source: Source) -> Iterator[Step]:
         yield Step("Go on", "The sweep is not finished.", f"tune-jobs resume {path}")
     if not source.is_trained or not source.trials:
         return
-    if settings is not None and settings.num_settings > 1 and not source.is_population:
+    is_open = settings is not None and settings.num_settings > 1 and not source.is_population
+    if is_open and not source.nothing_learned:
         about = replicate_takes(source)
         why = "Train the leading settings again with fresh seeds, until it is clear which is the best"
         yield Step("Replicate", f"{why}{f': about {about}' if about else ''}.", f"tune-jobs replicate {path}")
@@ -78,6 +79,9 @@ def _narrowed(source: Source) -> Iterator[Step]:
     spec, ranked = source.sweep.spec, source.ranked
     space = spec.get("space")
     if not isinstance(space, Mapping) or source.is_population or len(ranked) <= _LEAST_GOOD:
+        return
+    if source.nothing_learned:
+        # Where its best lie says nothing of where others might.
         return
     good = ranked[: max(_LEAST_GOOD, len(ranked) // 4)]
     narrowed = narrowed_space(space, [item.point for item in good])

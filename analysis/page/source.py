@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from analysis import report_data
+from analysis.answers import nothing_learned
 from analysis.best_records import BestRecord, SettingsRecord
 from analysis.core_seconds import core_seconds
 from analysis.importance import WhatMattered, what_mattered
@@ -60,6 +61,11 @@ class Source:
     def is_trained(self) -> bool:
         """Whether the sweep's policies learn, which those of baselines don't."""
         return report_data.is_trained(self.sweep)
+
+    @cached_property
+    def nothing_learned(self) -> str:
+        """That training has not led beyond random play, as a sentence; empty: it has, as far as is known."""
+        return nothing_learned(self.best) if self.is_trained and self.best is not None else ""
 
     @property
     def is_population(self) -> bool:

@@ -14,7 +14,7 @@ from synthetic_sweep import make_sweep as make_synthetic
 
 from analysis.answers import compared_with_random, nothing_learned
 from analysis.best_records import BestRecord
-from analysis.page import answer
+from analysis.page import answer, next_steps
 from analysis.records import IterationRecord
 from tests.narrowing import present
 from tune_jobs.cli import output
@@ -79,6 +79,21 @@ def test_the_report_says_what_to_do_and_proposes_no_more_seeds() -> None:
     found = answer.section(source_of(Synthetic(made.sweep, made.trials, made.results, lost)))
     assert found.sentences[0] == f"The best policy can't be told from random play over 100 episodes: {ADVICE}"
     assert found.command == ""
+
+
+def test_the_report_proposes_neither_more_seeds_nor_a_narrower_space_as_next_steps() -> None:
+    made = make_synthetic(points=[{"lr": value} for value in (3e-3, 3.1e-3, 2.9e-3, 3.2e-3, 1e-7, 2e-7)])
+    sweep = made.sweep.model_copy(
+        update={"spec": made.sweep.spec | {"space": {"lr": {"loguniform": [1e-8, 1e-1]}}, "num_samples": 6}}
+    )
+    best = present(made.best)
+    lost = best.model_copy(update={"confirmation": best.random})
+    titles = [
+        {step.title for step in next_steps.section(source_of(Synthetic(sweep, made.trials, made.results, each))).steps}
+        for each in (best, lost)
+    ]
+    assert titles[0] - titles[1] == {"Replicate", "Search a narrower space"}
+    assert "Extend" in titles[1]
 
 
 def finished(store: SweepStore, monkeypatch: pytest.MonkeyPatch, best: BestRecord) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -184,15 +185,16 @@ def _valid_draw(space: Mapping[str, Domain], index: int, seed: int, check: Check
 
     Of those that are asked for while the first ones still run, no plan has looked at any.
     """
-    for number, point in enumerate(_draws(space, index, seed), start=1):
+    last_error: SpecError | None = None
+    for point in itertools.islice(_draws(space, index, seed), _NUM_DRAWN):
         try:
             check(point)
-        except SpecError:
-            if number == _NUM_DRAWN:
-                raise
+        except SpecError as error:
+            last_error = error
         else:
             return point
-    raise AssertionError("draws never end")
+    assert last_error is not None
+    raise last_error
 
 
 def _new_draw(

@@ -61,9 +61,14 @@ def are_all_alike(results: Sequence[IterationRecord]) -> bool:
     Args:
         results: Of all trials of the search.
     """
-    evaluated = {line.evaluation_return for line in results if line.evaluation_return is not None}
-    trained = {value for line in results for value in line.episode_returns}
-    return bool(evaluated) and len(evaluated | trained) == 1
+    if all(line.evaluation_return is None for line in results):
+        return False
+    # Most end with the second of them: nothing is gathered, as there may be millions.
+    returns = (
+        value for line in results for value in (line.evaluation_return, *line.episode_returns) if value is not None
+    )
+    first = next(returns)
+    return all(value == first for value in returns)
 
 
 def different_points(settings: Sequence[SettingScores]) -> list[int]:

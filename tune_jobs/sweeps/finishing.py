@@ -7,7 +7,10 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
+from analysis.answers import nothing_learned
 from analysis.best_records import BestRecord
+from analysis.records import SweepRecord
+from analysis.report_data import is_trained
 from policies.errors import EnvFailedError, TuneJobsError
 from tune_jobs.process.interruption import current
 from tune_jobs.store.contract import Sweep
@@ -34,9 +37,17 @@ def finish_sweep(store: Sweep, result: SweepResult, progress: str = "none", *, k
         why_no_best=made.why_no_best,
         finish_failed=made.failed,
         artifacts=made.artifacts,
-        notes=tuple(made.notes),
+        notes=(*_beside_random(result.sweep, made.best), *made.notes),
         interrupted=made.stopped or current().came,
     )
+
+
+def _beside_random(sweep: SweepRecord, best: BestRecord | None) -> tuple[str, ...]:
+    """Return a note where training has not led beyond random play: all else is said in the tone of a result."""
+    if best is None or not is_trained(sweep):
+        return ()
+    told = nothing_learned(best)
+    return (told,) if told else ()
 
 
 class _Finish:
@@ -80,7 +91,6 @@ class _Finish:
         except TuneJobsError as error:
             self._why = error
         self.failed = self._why is not None
-        self._compare_with_random()
         if self.best is not None and not kept:
             self._films_and_report(self.best)
             return
@@ -94,14 +104,6 @@ class _Finish:
             self.artifacts["report"] = page
         else:
             self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
-
-    def _compare_with_random(self) -> None:
-        """Note it where training has not led beyond random play: all else is said in the tone of a result."""
-        from analysis.answers import nothing_learned
-        from analysis.report_data import is_trained
-
-        if self.best is not None and is_trained(self._store.read_record()) and (told := nothing_learned(self.best)):
-            self.notes.append(told)
 
     def _films_and_report(self, best: BestRecord) -> None:
         """Film the winner, and draw the report meanwhile."""
