@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from torch.nn import functional
 _aten = torch.ops.aten
 
 Floats = NDArray[np.float32]
+Kept = Tensor | list[Tensor]
+"""What a backward pass needs: of all networks in one, or of each run of networks with one activation."""
 
 
 # torch's own elu and silu compute the last few numbers of an array by another routine than the others, so that a number
@@ -95,3 +98,58 @@ ACTIVATIONS = {
     "elu": Activation(_elu, _elu_backward, keeps_input=True),
     "gelu": Activation(functional.gelu, _aten.gelu_backward, keeps_input=True),
 }
+
+
+class StackedActivations:
+    """The activations of stacked networks, of which each may have another: those in a run of one kind are one call.
+
+    Args:
+        names: A name of `policies.activations.ACTIVATIONS` for each network, K of them.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names, runs, start = tuple(names), [], 0
+        for name, alike in itertools.groupby(names):
+            stop = start + len(list(alike))
+            runs.append((slice(start, stop), ACTIVATIONS[name]))
+            start = stop
+        self._runs: Sequence[tuple[slice, Activation]] = runs
+        self._one = runs[0][1] if len(runs) == 1 else None
+        self._keeps_input = any(activation.keeps_input for _, activation in runs)
+
+    def part(self, start: int, stop: int) -> StackedActivations:
+        """Return those of the networks from start to stop."""
+        return StackedActivations(self._names[start:stop])
+
+    def apply(self, x: Tensor) -> tuple[Tensor, Kept]:
+        """Return the outputs, (K, ...), computed in place if they can be, and what `gradient` needs of them."""
+        if self._one is not None:
+            return self._one.apply(x)
+        out, kept = x.clone() if self._keeps_input else x, []
+        for run, activation in self._runs:
+            part = out[run]
+            if activation.forward is not None and (found := activation.forward(part)) is not part:
+                part.copy_(found)
+            kept.append(x[run] if activation.keeps_input else part)
+        return out, kept
+
+    def gradient(self, gradient: Tensor, kept: Kept) -> Tensor:
+        """Return the gradient of the inputs from that of the outputs, (K, ...), whose memory it may take."""
+        if isinstance(kept, Tensor):
+            assert self._one is not None
+            return self._one.gradient(gradient, kept)
+        for (run, activation), of_run in zip(self._runs, kept, strict=True):
+            if activation.backward is not None:
+                part = gradient[run]
+                part.copy_(activation.backward(part, of_run))
+        return gradient
+
+    def apply_to_few(self, x: Floats) -> Floats:
+        """Return the outputs for a few rows, (K, ...), which may be computed in place."""
+        if self._one is not None:
+            return self._one.apply_to_few(x)
+        for run, activation in self._runs:
+            part = x[run]
+            if (found := activation.apply_to_few(part)) is not part:
+                part[...] = found
+        return x

@@ -20,7 +20,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from torch import Tensor
 
-from policies.packed.activations import Activation
+from policies.packed.activations import Kept, StackedActivations
 from policies.portable.convolution import Filter, output_shape
 
 Floats = NDArray[np.float32]
@@ -110,12 +110,12 @@ class StackedConvolutions:
 
     Args:
         sizes: The convolutions, from input to output.
-        activation: The activation after each.
+        activations: What each network has after each of them.
     """
 
-    def __init__(self, sizes: Sequence[Convolution], activation: Activation) -> None:
-        self.sizes, self._activation = tuple(sizes), activation
-        self._kept: list[tuple[Tensor, Tensor]] = []
+    def __init__(self, sizes: Sequence[Convolution], activations: StackedActivations) -> None:
+        self.sizes, self._activations = tuple(sizes), activations
+        self._kept: list[tuple[Tensor, Kept]] = []
 
     def forward(self, images: Tensor, layers: Sequence[Tensor]) -> Tensor:
         """Return the features, (K, B, numbers), of images, (K, B, D or more), and keep what `backward` needs."""
@@ -123,16 +123,16 @@ class StackedConvolutions:
         num_images = images.shape[1]
         for sizes, layer in zip(self.sizes, layers, strict=True):
             windows = sizes.windows(images)
-            out, kept = self._activation.apply(torch.baddbmm(layer[:, -1:], windows, layer[:, :-1]))
+            out, kept = self._activations.apply(torch.baddbmm(layer[:, -1:], windows, layer[:, :-1]))
             self._kept.append((windows, kept))
             images = out.view(len(out), num_images, -1)
         return images
 
-    def evaluate(self, images: Tensor, layers: Sequence[Tensor]) -> Tensor:
-        """Return the same features, and keep nothing."""
+    def evaluate(self, images: Tensor, layers: Sequence[Tensor], activations: StackedActivations) -> Tensor:
+        """Return the same features of some of the networks, which have these activations, and keep nothing."""
         num_images = images.shape[1]
         for sizes, layer in zip(self.sizes, layers, strict=True):
-            out, _ = self._activation.apply(torch.baddbmm(layer[:, -1:], sizes.windows(images), layer[:, :-1]))
+            out, _ = activations.apply(torch.baddbmm(layer[:, -1:], sizes.windows(images), layer[:, :-1]))
             images = out.view(len(out), num_images, -1)
         return images
 
@@ -140,7 +140,8 @@ class StackedConvolutions:
         """Write the gradients of the weights from those of the features of the last `forward`, (K, B, features)."""
         for number in range(len(self.sizes) - 1, -1, -1):
             sizes, (windows, kept) = self.sizes[number], self._kept[number]
-            gradient = self._activation.gradient(gradient.reshape(kept.shape), kept)
+            gradient = gradient.reshape(len(windows), windows.shape[1], sizes.num_filters)
+            gradient = self._activations.gradient(gradient, kept)
             torch.bmm(windows.transpose(1, 2), gradient, out=gradients[number][:, :-1])
             torch.sum(gradient, dim=1, out=gradients[number][:, -1])
             if number:
@@ -154,5 +155,5 @@ class StackedConvolutions:
         for sizes, (matrix, bias) in zip(self.sizes, layers, strict=True):
             out = np.matmul(sizes.windows_of_few(images), matrix)
             out += bias
-            images = self._activation.apply_to_few(out).reshape(len(out), num_images, -1)
+            images = self._activations.apply_to_few(out).reshape(len(out), num_images, -1)
         return images

@@ -188,14 +188,17 @@ def num_stack_outputs(hyperparams: TrainedHyperparams, num_outputs: int) -> int:
     return num_outputs + hyperparams.dueling
 
 
-MAX_GROUP = 8
-"""The networks of this many members, with their activations, fit a core's cache; larger groups are no faster."""
+MAX_GROUP = 12
+"""Up to about this many members an update of small networks becomes cheaper for each; beyond, a core's cache is too
+small for what larger ones keep (decision 10)."""
 
 
 def group_members(
     members: Sequence[Member[H]], max_size: int = MAX_GROUP, also: Callable[[Member[H]], Any] = lambda _: 0
 ) -> list[list[Member[H]]]:
-    """Group the members whose networks are computed together: the same activation and about the same sizes.
+    """Group the members whose networks are computed together: about the same sizes.
+
+    Members of one activation are neighbours in a group: what they have in common is one call.
 
     Args:
         members: All members of a stack.
@@ -207,7 +210,8 @@ def group_members(
         return group_key(member.hyperparams), also(member)
 
     groups = []
-    for _, alike in itertools.groupby(sorted(members, key=key), key=key):
+    by_activation = sorted(members, key=lambda member: member.hyperparams.activation)
+    for _, alike in itertools.groupby(sorted(by_activation, key=key), key=key):
         found = list(alike)
         num_groups = -(-len(found) // max_size)
         bounds = [len(found) * number // num_groups for number in range(num_groups + 1)]

@@ -2,9 +2,9 @@
 
 Shapes: K networks, B rows per network, D numbers per row, L hidden layers, A outputs.
 
-The networks of a stack have the same activation and layer sizes. Smaller ones are padded with zeros, which is exact: a
-padded unit's input is 0 and every activation maps 0 to 0, so its output and the gradients of all padded weights are 0,
-and an optimizer that starts at 0 leaves them there.
+The networks of a stack have the same layer sizes. Smaller ones are padded with zeros, which is exact: a padded unit's
+input is 0 and every activation maps 0 to 0, so its output and the gradients of all padded weights are 0, and an
+optimizer that starts at 0 leaves them there. Each network may have an activation of its own.
 
 The backward pass is written out. On networks of this size torch's graph costs more than the products in it.
 """
@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from policies.packed.activations import ACTIVATIONS
+from policies.packed.activations import Kept, StackedActivations
 from policies.packed.convolutions import Convolution, StackedConvolutions
 from policies.packed.sizes import LINE, NARROW
 
@@ -38,7 +38,8 @@ class StackedNetworks:
     Args:
         num_networks: The number of networks, K.
         sizes: The number of inputs of the first dense layer, the units of each hidden layer, and the number of outputs.
-        activation: A name of `policies.activations.ACTIVATIONS`.
+        activations: A name of `policies.activations.ACTIVATIONS` for each network. Calls are fewest where equal ones
+            are neighbours.
         device: Where the weights lie.
         convolutions: The convolutions before the dense layers, whose last output has as many numbers as `sizes` begins
             with.
@@ -55,11 +56,11 @@ class StackedNetworks:
         self,
         num_networks: int,
         sizes: Sequence[int],
-        activation: str,
+        activations: Sequence[str],
         device: str = "cpu",
         convolutions: Sequence[Convolution] = (),
     ) -> None:
-        self.num_networks, self.sizes, self.activation = num_networks, tuple(sizes), activation
+        self.num_networks, self.sizes = num_networks, tuple(sizes)
         self.convolutions = tuple(convolutions)
         self._shapes = [
             *((one.window + 1, one.num_filters) for one in convolutions),
@@ -70,9 +71,9 @@ class StackedNetworks:
         self.gradients = torch.zeros_like(self.weights)
         self.layers = self._views(self.weights)
         self.gradient_layers = self._views(self.gradients)
-        self._activation = ACTIVATIONS[activation]
-        self._stacked = StackedConvolutions(convolutions, self._activation)
-        self._kept: list[tuple[Tensor, Tensor]] = []
+        self.activations = StackedActivations(activations)
+        self._stacked = StackedConvolutions(convolutions, self.activations)
+        self._kept: list[tuple[Tensor, Kept]] = []
 
     def _views(self, flat: Tensor) -> list[Tensor]:
         views, start = [], 0
@@ -101,21 +102,21 @@ class StackedNetworks:
         return _product(x, self.layers[-1])
 
     def _activate(self, inputs: Tensor, x: Tensor) -> Tensor:
-        out, kept = self._activation.apply(x)
+        out, kept = self.activations.apply(x)
         self._kept.append((inputs, kept))
         return out
 
     def evaluate(self, x: Tensor, start: int, stop: int) -> Tensor:
         """Return the outputs of only the networks from start to stop; nothing is kept for a `backward`."""
         num = len(self.convolutions)
-        layers = [layer[start:stop] for layer in self.layers]
+        layers, activations = [layer[start:stop] for layer in self.layers], self.activations.part(start, stop)
         if num:
-            x = self._stacked.evaluate(x, layers[:num])
+            x = self._stacked.evaluate(x, layers[:num], activations)
             x = _product(x, layers[num])
         else:
             x = torch.bmm(x, layers[0])
         for layer in layers[num + 1 :]:
-            x, _ = self._activation.apply(x)
+            x, _ = activations.apply(x)
             x = _product(x, layer)
         return x
 
@@ -128,7 +129,7 @@ class StackedNetworks:
         for number in range(len(dense) - 2, -1, -1):
             gradient = torch.bmm(gradient, dense[number + 1][:, :-1].transpose(1, 2))
             x, kept = self._kept[number]
-            gradient = self._activation.gradient(gradient, kept)
+            gradient = self.activations.gradient(gradient, kept)
             if number or num:
                 _set_gradients(gradients[number], x, gradient)
             else:
@@ -189,9 +190,9 @@ class ActingNetworks:
 
     def __init__(self, networks: StackedNetworks, num_acting: int) -> None:
         self._networks, self._num_acting = networks, num_acting
-        self._activation = ACTIVATIONS[networks.activation]
+        self._activations = networks.activations.part(0, num_acting)
         self._num_convolutions = len(networks.convolutions)
-        self._convolutions = StackedConvolutions(networks.convolutions, self._activation)
+        self._convolutions = StackedConvolutions(networks.convolutions, self._activations)
         self.refresh()
 
     def refresh(self) -> None:
@@ -209,7 +210,7 @@ class ActingNetworks:
         for matrix, bias in self._layers[num:-1]:
             x = np.matmul(x, matrix)
             x += bias
-            x = self._activation.apply_to_few(x)
+            x = self._activations.apply_to_few(x)
         matrix, bias = self._layers[-1]
         out: Floats = np.matmul(x, matrix)
         out += bias

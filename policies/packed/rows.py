@@ -21,7 +21,7 @@ class StackedRows:
     """The stacked networks of some members, made from the members' own weights.
 
     Args:
-        members: Members with equally many layers, one activation and the same convolutions.
+        members: Members with equally many layers and the same convolutions.
         shape: The shape of what networks see of an observation: (n,), or (height, width, channels).
         num_outputs: The number of outputs of a policy's head, or of actions.
         device: Where the weights lie.
@@ -40,7 +40,8 @@ class StackedRows:
         num_inputs = math.prod(convolutions[-1].out if convolutions else shape)
         sizes = (num_inputs, *hidden, num_stack_outputs(first, num_outputs))
         num_networks = self.networks_per_member * len(members)
-        self.networks = StackedNetworks(num_networks, sizes, first.activation, device, convolutions)
+        activations = [member.hyperparams.activation for member in members] * self.networks_per_member
+        self.networks = StackedNetworks(num_networks, sizes, activations, device, convolutions)
         for _, layers, member, layout in self._rows(self.networks.layers):
             layout.write(layers, member.weights, prefix)
 

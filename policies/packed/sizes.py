@@ -20,12 +20,12 @@ def size_class(num_units: int) -> int:
     return size
 
 
-def group_key(hyperparams: TrainedHyperparams) -> tuple[str, tuple[Filter, ...], tuple[int, ...]]:
+def group_key(hyperparams: TrainedHyperparams) -> tuple[tuple[Filter, ...], tuple[int, ...]]:
     """Return what the members of a group have in common beside what a stack's have; it is sortable.
 
     Convolutions are not padded: another kernel or stride sees other windows, and more filters are more inputs later.
     """
-    return hyperparams.activation, hyperparams.conv_filters or (), tuple(map(size_class, hyperparams.hidden_sizes))
+    return hyperparams.conv_filters or (), tuple(map(size_class, hyperparams.hidden_sizes))
 
 
 def is_padded_beside(ours: TrainedHyperparams, theirs: TrainedHyperparams) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -44,12 +44,19 @@ def space_of(dtype: Any = np.float32) -> Any:
     return gym.spaces.Box(0, 255 if dtype == np.uint8 else 1, IMAGE, dtype)
 
 
-def make_members(filters: Sequence[Any], **values: Any) -> list[Member[PPOHyperparams]]:
+def make_members(filters: Sequence[Any], activation: str = "tanh") -> list[Member[PPOHyperparams]]:
+    """Make members with one activation, or with each one of those that are named with "-" between."""
     import gymnasium as gym
 
+    names = itertools.cycle(activation.split("-"))
     settings = [
-        PPOHyperparams(**{"hidden_sizes": sizes, "conv_filters": tuple(filters), "initializer": "orthogonal", **values})
-        for sizes in ((7,), (5,), (8,))
+        PPOHyperparams(
+            hidden_sizes=sizes,
+            conv_filters=tuple(filters),
+            initializer="orthogonal",
+            activation=cast("Any", name),
+        )
+        for sizes, name in zip(((7,), (5,), (8,)), names, strict=False)
     ]
     return [
         new_member(f"m{index}", one, index, space_of(), gym.spaces.Discrete(3)) for index, one in enumerate(settings)
@@ -77,7 +84,7 @@ def torch_networks(member: Member[PPOHyperparams]) -> list[nn.Sequential]:
     return found
 
 
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("activation", [*ACTIVATIONS, "relu-linear-tanh", "silu-relu-gelu"])
 @pytest.mark.parametrize("filters", FILTERS, ids=str)
 def test_outputs_and_gradients_are_torchs(filters: tuple[Any, ...], activation: str) -> None:
     members = make_members(filters, activation=activation)
@@ -112,7 +119,7 @@ def test_outputs_and_gradients_are_torchs(filters: tuple[Any, ...], activation: 
             expected = owner.moments["expected"][name]
             assert value.shape == expected.shape
             np.testing.assert_allclose(value, expected, atol=ROUNDING * max(1.0, np.abs(expected).max()), err_msg=name)
-            assert np.abs(expected).max() > 0 or activation == "relu", (row, name)
+            assert np.abs(expected).max() > 0 or owner.hyperparams.activation == "relu", (row, name)
 
 
 @pytest.mark.parametrize("filters", FILTERS, ids=str)

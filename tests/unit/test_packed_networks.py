@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
@@ -36,12 +37,16 @@ SIZES: dict[int, list[tuple[int, ...]]] = {
     3: [(8, 12, 6), (7, 5, 4), (8, 12, 3)],
 }
 ROWS = 10
+# Each network with one of its own: computed in place, beside one that keeps its input, and of two of one kind.
+MIXED = ("relu-linear-tanh", "silu-elu-gelu", "linear-silu-relu", "gelu-tanh-tanh")
 
 
 def make_stack(num_layers: int, activation: str, *, shares: bool) -> tuple[list[Member[PPOHyperparams]], StackedRows]:
+    """Make members with one activation or, of `MIXED`, with one each."""
+    names = itertools.cycle(activation.split("-"))
     members = [
-        random_member(f"m{index}", index, hidden_sizes=sizes, activation=activation, vf_share_layers=shares)
-        for index, sizes in enumerate(SIZES[num_layers])
+        random_member(f"m{index}", index, hidden_sizes=sizes, activation=name, vf_share_layers=shares)
+        for index, (sizes, name) in enumerate(zip(SIZES[num_layers], names, strict=False))
     ]
     return members, StackedRows(members, (NUM_INPUTS,), NUM_OUTPUTS, "cpu")
 
@@ -101,7 +106,7 @@ def is_padding(rows: StackedRows, members: Sequence[Member[PPOHyperparams]]) -> 
 
 @pytest.mark.parametrize("shares", [False, True])
 @pytest.mark.parametrize("num_layers", sorted(SIZES))
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("activation", [*ACTIVATIONS, *MIXED])
 @pytest.mark.usefixtures("in_double")
 def test_outputs_and_gradients_are_those_of_separate_modules(activation: str, num_layers: int, shares: bool) -> None:
     members, rows = make_stack(num_layers, activation, shares=shares)
@@ -137,7 +142,7 @@ def test_weights_that_are_written_into_a_stack_come_back() -> None:
 
 
 @pytest.mark.parametrize("kind", ["adam", "rmsprop"])
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("activation", [*ACTIVATIONS, *MIXED])
 def test_padding_stays_zero(activation: str, kind: str) -> None:
     members, rows = make_stack(3, activation, shares=False)
     networks, column = rows.networks, torch.full((2 * len(members), 1), 0.9)
@@ -318,27 +323,25 @@ def test_sizes_are_padded_by_a_third_at_most() -> None:
         assert size_class(padded) == padded
 
 
-def test_groups_are_of_one_activation_and_like_sizes() -> None:
+def test_groups_are_of_like_sizes_with_equal_activations_side_by_side() -> None:
     rng = np.random.default_rng(0)
     members = [
         random_member(f"m{index}", hidden_sizes=(int(rng.choice([9, 12, 30])), 8), activation=str(activation))
-        for index, activation in enumerate(rng.choice(["relu", "tanh"], size=60))
+        for index, activation in enumerate(rng.choice(["relu", "tanh", "linear"], size=60))
     ]
     groups = group_members(members)
     assert sorted(member.member_id for group in groups for member in group) == sorted(m.member_id for m in members)
     for group in groups:
-        assert len({member.hyperparams.activation for member in group}) == 1
+        activations = [member.hyperparams.activation for member in group]
+        assert len([name for name, _ in itertools.groupby(activations)]) == len(set(activations))
         assert len({size_class(member.hyperparams.hidden_sizes[0]) for member in group}) == 1
+    assert any(len({member.hyperparams.activation for member in group}) > 1 for group in groups)
     sizes = [len(group) for group in groups]
     assert max(sizes) <= MAX_GROUP
     # As few as there can be, and of even sizes.
-    assert len(groups) == sum(math.ceil(n / MAX_GROUP) for n in _members_by_key(members))
+    classes = [size_class(member.hyperparams.hidden_sizes[0]) for member in members]
+    assert len(groups) == sum(math.ceil(classes.count(one) / MAX_GROUP) for one in set(classes))
     assert min(sizes) >= MAX_GROUP // 2
-
-
-def _members_by_key(members: Sequence[Member[PPOHyperparams]]) -> list[int]:
-    keys = [(m.hyperparams.activation, size_class(m.hyperparams.hidden_sizes[0])) for m in members]
-    return [keys.count(key) for key in set(keys)]
 
 
 @pytest.mark.parametrize(
@@ -348,7 +351,7 @@ def _members_by_key(members: Sequence[Member[PPOHyperparams]]) -> list[int]:
         ({"hidden_sizes": (24, 18)}, {"hidden_sizes": (21, 18)}, False),
         ({"hidden_sizes": (21, 24)}, {"hidden_sizes": (24, 21)}, True),
         ({"hidden_sizes": (32,)}, {"hidden_sizes": (64,)}, False),
-        ({"hidden_sizes": (21,)}, {"hidden_sizes": (24,), "activation": "relu"}, False),
+        ({"hidden_sizes": (21,)}, {"hidden_sizes": (24,), "activation": "relu"}, True),
         ({"hidden_sizes": (21,)}, {"hidden_sizes": (21, 24)}, False),
         ({"hidden_sizes": (21,)}, {"hidden_sizes": (21,), "lr": 1e-2}, False),
     ],
@@ -369,14 +372,14 @@ def test_networks_of_other_depth_are_not_grouped() -> None:
 
 
 def test_a_stack_starts_without_weights() -> None:
-    networks = StackedNetworks(2, (3, 4, 1), "relu")
+    networks = StackedNetworks(2, (3, 4, 1), ["relu"] * 2)
     assert networks.weights.shape == (2, 16 + 16)
     assert (networks.weights == 0).all()
 
 
 def test_every_layer_of_every_network_begins_at_a_cache_line() -> None:
     """Otherwise kernels of some CPUs round by a network's place in the stack."""
-    networks = StackedNetworks(3, (3, 5, 7, 2), "relu")
+    networks = StackedNetworks(3, (3, 5, 7, 2), ["relu"] * 3)
     for layers in (networks.layers, networks.gradient_layers):
         assert [tuple(layer.shape[1:]) for layer in layers] == [(4, 5), (6, 7), (8, 2)]
         assert {layer[row].data_ptr() % 64 for layer in layers for row in range(3)} == {0}
@@ -385,7 +388,7 @@ def test_every_layer_of_every_network_begins_at_a_cache_line() -> None:
 @pytest.mark.parametrize("num_outputs", [1, 2, 3, 5, 6, 15])
 def test_what_a_network_computes_does_not_depend_on_its_place_in_the_stack(num_outputs: int) -> None:
     rng = torch.Generator().manual_seed(num_outputs)
-    stack, alone = (StackedNetworks(number, (9, 32, 32, num_outputs), "relu") for number in (5, 1))
+    stack, alone = (StackedNetworks(number, (9, 32, 32, num_outputs), ["relu"] * number) for number in (5, 1))
     stack.weights.normal_(generator=rng)
     for num_rows in (32, 33, 128):
         x, gradient = (torch.randn(5, num_rows, number, generator=rng) for number in (10, num_outputs))

@@ -133,12 +133,8 @@ def test_gradients_by_hand_of_continuous_actions_are_those_of_the_loss(
 @pytest.mark.parametrize("entropy_coeff", [0.0, 0.01])
 def test_gradients_without_a_value_clip(entropy_coeff: float) -> None:
     outputs, values, batch = make_case(2, with_kl=False)
-    coefficients = ppo.Coefficients(
-        **{
-            **vars(COEFFICIENTS),
-            "vf_clip_param": column(*[math.inf] * M),
-            "entropy_coeff": column(*[entropy_coeff] * M),
-        }
+    coefficients = replace(
+        COEFFICIENTS, vf_clip_param=column(*[math.inf] * M), entropy_coeff=column(*[entropy_coeff] * M)
     )
     checked_gradients(outputs, values, batch, coefficients, ppo.Heads((2,)))
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from networks_alone import check_alone
 
+from policies.activations import ACTIVATIONS
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
-from policies.packed.networks import StackedNetworks
+from policies.packed.networks import ActingNetworks, StackedNetworks
 from policies.packed.sizes import may_round_by_place
 
 
@@ -61,7 +63,29 @@ def test_in_whole_cache_lines_the_place_rounds_nothing(
     num_rows: int, hidden_sizes: tuple[int, ...], num_outputs: int
 ) -> None:
     rng = torch.Generator().manual_seed(num_rows)
-    stack, alone = (StackedNetworks(number, (9, *hidden_sizes, num_outputs), "tanh") for number in (4, 1))
+    stack, alone = (StackedNetworks(number, (9, *hidden_sizes, num_outputs), ["tanh"] * number) for number in (4, 1))
     stack.weights.normal_(generator=rng)
     x, gradient = (torch.randn(4, num_rows, number, generator=rng) for number in (10, num_outputs))
     check_alone(stack, alone, x, gradient)
+
+
+@pytest.mark.parametrize("hidden_sizes", [(32,), (17, 33)])
+@pytest.mark.parametrize("beside", ACTIVATIONS)
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_nor_do_the_activations_beside_it(activation: str, beside: str, hidden_sizes: tuple[int, ...]) -> None:
+    """Of three networks the first and the last have another one than that between them."""
+    rng = torch.Generator().manual_seed(len(hidden_sizes))
+    sizes, num_rows = (9, *hidden_sizes, 2), 48
+    stack = StackedNetworks(3, sizes, [beside, activation, beside])
+    stack.weights.normal_(generator=rng)
+    x, gradient = (torch.randn(3, num_rows, number, generator=rng) for number in (10, 2))
+    alone = StackedNetworks(1, sizes, [activation])
+    outputs = stack.forward(x)
+    stack.backward(gradient)
+    found = stack.gradients.clone()
+    alone.weights.copy_(stack.weights[1:2])
+    assert torch.equal(alone.forward(x[1:2]), outputs[1:2])
+    alone.backward(gradient[1:2])
+    assert torch.equal(alone.gradients, found[1:2])
+    few = x[..., :-1].numpy()
+    assert np.array_equal(ActingNetworks(stack, 3)(few)[1], ActingNetworks(alone, 1)(few[1:2])[0])

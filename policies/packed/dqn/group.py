@@ -31,7 +31,7 @@ Floats = NDArray[np.float32]
 
 
 class DQNGroup:
-    """M members with one activation and about the same layer sizes, whose updates are due at the same time.
+    """M members with about the same layer sizes, whose updates are due at the same time.
 
     Args:
         members: The members.
@@ -103,6 +103,7 @@ class DQNGroup:
         """Return Q-values or advantages, (M, N, A), for prepared observations, (M, N, D)."""
         return self._acting(observations)[..., : self._num_actions]
 
+    @torch.inference_mode()
     @denormals_as_zero()
     def learn(self, numbers: NDArray[np.float64], num_new_steps: int, *, wants_stats: bool) -> list[dict[str, float]]:
         """Make the updates of one training phase.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,7 @@ class Batch:
 
 
 class PPOGroup:
-    """M members with one activation and about the same layer sizes.
+    """M members with about the same layer sizes.
 
     Args:
         members: The members.
@@ -126,6 +126,7 @@ class PPOGroup:
             return self._networks.forward(observations)[..., -1]
         return self._networks.evaluate(observations, num_members, 2 * num_members)[..., 0]
 
+    @torch.inference_mode()
     @denormals_as_zero()
     def learn(self, batch: Batch) -> None:
         """Make the updates of one iteration, or on a GPU start them; `finish` has to be called next."""
@@ -250,11 +251,13 @@ class PPOGroup:
             clip.append([linear(item.clip_param, item.clip_param_final, item.clip_decay_steps, now)])
         column = torch.tensor(lr, device=self._device, dtype=torch.float32)
         self._optimizer.lr = column.repeat(self._rows.networks_per_member, 1)
-        self._coefficients.entropy_coeff = torch.tensor(entropy, device=self._device, dtype=torch.float32)
-        self._coefficients.clip_param = torch.tensor(clip, device=self._device, dtype=torch.float32)
+        changed = {"entropy_coeff": entropy, "clip_param": clip}
         if self._shared.use_kl_loss:
-            weights = [[member.kl_coeff] for member in self.members]
-            self._coefficients.kl_coeff = torch.tensor(weights, device=self._device, dtype=torch.float32)
+            changed["kl_coeff"] = [[member.kl_coeff] for member in self.members]
+        columns = {
+            name: torch.tensor(values, device=self._device, dtype=torch.float32) for name, values in changed.items()
+        }
+        self._coefficients = replace(self._coefficients, **columns)
 
     def _stats(self, parts: ppo.Parts, norms: Tensor | None, num_updates: int) -> list[dict[str, float]]:
         columns = {name: value.tolist() for name, value in vars(parts).items()}

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -51,9 +52,9 @@ class Heads:
         return found
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Coefficients:
-    """The coefficients of the parts of the loss, (M, 1) each."""
+    """The coefficients of the parts of the loss in one iteration, (M, 1) each."""
 
     clip_param: Tensor
     vf_clip_param: Tensor
@@ -63,6 +64,23 @@ class Coefficients:
     vf_loss_coeff: Tensor
     entropy_coeff: Tensor
     kl_coeff: Tensor
+
+    # Computed once an iteration: of an update of small networks each call is a part.
+
+    @cached_property
+    def least_and_most(self) -> tuple[Tensor, Tensor]:
+        """The limits of the ratio of probabilities, (M, 1) each."""
+        return 1 - self.clip_param, 1 + self.clip_param
+
+    @cached_property
+    def has_entropy(self) -> bool:
+        """Whether any member is rewarded for entropy."""
+        return bool(self.entropy_coeff.any())
+
+    @cached_property
+    def limits_errors(self) -> bool:
+        """Whether any member's squared value error is clipped."""
+        return not bool(self.vf_clip_param.isinf().all())
 
 
 @dataclass(eq=False)
@@ -120,7 +138,7 @@ def _choices_gradient(outputs: Tensor, batch: Minibatch, coefficients: Coefficie
     probabilities = logp_all.exp()
     weight = _weights((logp_all * batch.actions).sum(dim=-1), batch, coefficients)
     out = (probabilities - batch.actions).mul_(weight)
-    if bool(coefficients.entropy_coeff.any()):
+    if coefficients.has_entropy:
         entropy = heads.entropies(probabilities, logp_all)
         scale = (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
         out += (logp_all + entropy).mul_(probabilities).mul_(scale)
@@ -165,7 +183,7 @@ def _weights(logp: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tens
     """Return what the gradient of each row's log probability, (M, B), counts in the mean of what is won, (M, B, 1)."""
     ratio = (logp - batch.logp).exp_()
     surrogate = batch.advantages * ratio
-    limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param).mul_(batch.advantages)
+    limited = torch.clamp(ratio, *coefficients.least_and_most).mul_(batch.advantages)
     # The minimum passes the gradient where the ratio itself is smaller, where both are equal, and where it is NaN.
     return torch.where(surrogate > limited, 0.0, surrogate).mul_(1 / logp.shape[1]).unsqueeze(-1)
 
@@ -173,7 +191,7 @@ def _weights(logp: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tens
 def _value_gradient(values: Tensor, batch: Minibatch, coefficients: Coefficients) -> Tensor:
     errors = values - batch.value_targets
     factor = coefficients.vf_loss_coeff * (2 / values.shape[1])
-    if batch.old_values is None and bool(coefficients.vf_clip_param.isinf().all()):
+    if batch.old_values is None and not coefficients.limits_errors:
         return errors.mul_(factor)
     squares = _squared_errors(values, batch, coefficients)
     is_flat = squares > coefficients.vf_clip_param
@@ -199,7 +217,7 @@ def loss(outputs: Tensor, values: Tensor, batch: Minibatch, coefficients: Coeffi
     """Return each member's loss and its parts, as RLlib computes them; the arguments are those of `gradients`."""
     logp, entropy = _logp_and_entropy(outputs, batch.actions, heads=heads)
     ratio = torch.exp(logp - batch.logp)
-    limited = torch.clamp(ratio, 1 - coefficients.clip_param, 1 + coefficients.clip_param)
+    limited = torch.clamp(ratio, *coefficients.least_and_most)
     surrogate = torch.min(batch.advantages * ratio, batch.advantages * limited)
     vf_loss = torch.minimum(_squared_errors(values, batch, coefficients), coefficients.vf_clip_param)
     kl = torch.zeros_like(entropy)
