@@ -122,6 +122,29 @@ def test_images_whose_channels_come_first_are_to_be_turned(
 
 
 @pytest.mark.parametrize(
+    ("shape", "filters", "is_noted"),
+    [
+        ((3, 12, 12), [[8, 3, 1]], True),
+        ((4, 84, 84), [[8, 4, 2]], True),
+        ((1, 10, 12), [[8, 1, 1]], True),
+        ((12, 12, 3), [[8, 3, 1]], False),
+        ((5, 12, 12), [[8, 3, 1]], False),
+        ((3, 3, 12), [[8, 3, 1]], False),
+    ],
+    ids=str,
+)
+def test_filters_that_happen_to_fit_images_whose_channels_come_first_are_noted(
+    shape: tuple[int, ...], filters: Any, is_noted: bool
+) -> None:
+    notes = plan({"id": SIZED, "args": {"shape": list(shape)}}, hyperparams={"conv_filters": filters}).notes
+    found = [note for note in notes if "Channels come last" in note]
+    assert len(found) == is_noted
+    if is_noted:
+        assert f"but {shape} looks as if they came first." in found[0]
+        assert found[0].endswith("puts the channels last.")
+
+
+@pytest.mark.parametrize(
     "spec",
     [
         {"hyperparams": {"free_log_std": True}},

@@ -130,8 +130,11 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
                 raise SpecError(
                     f"{env.env_id} has images of shape {shape} as observations, but {place} is null: a network for "
                     "images begins with convolutions.",
-                    f"{_channels_hint(spec, env)}Set {place} to [channels, kernel, stride] of each layer, such as "
-                    f"{_example(spec, env)}.",
+                    _with_channels(
+                        spec,
+                        env,
+                        f"Set {place} to [channels, kernel, stride] of each layer, such as {_example(spec, env)}.",
+                    ),
                 )
             continue
         if not env.observes_images:
@@ -143,7 +146,7 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
         try:
             output_shape(shape, filters)
         except SpecError as error:
-            hint = f"{_channels_hint(spec, env)}{error.hint}"
+            hint = _with_channels(spec, env, error.hint)
             raise SpecError(f"{place} does not fit {env.env_id}: {error.message}", hint) from error
 
 
@@ -155,8 +158,8 @@ def _example(spec: SweepSpec, env: EnvInfo) -> str:
     return next(example for fewest, example in examples if smallest >= fewest)
 
 
-def _channels_hint(spec: SweepSpec, env: EnvInfo) -> str:
-    """Return what to do about images whose channels seem to come first, as words before another hint; or nothing."""
+def channels_hint(spec: SweepSpec, env: EnvInfo) -> str:
+    """Return what to do about images whose channels seem to come first; empty: they don't."""
     shape = env.observation_space.shape or ()
     if not _has_channels_first(shape):
         return ""
@@ -164,8 +167,12 @@ def _channels_hint(spec: SweepSpec, env: EnvInfo) -> str:
     own_shape = (*shape[:2], shape[2] // spec.env.frame_stack)
     return (
         f"Channels come last here, (rows, columns, channels), but {own_shape} looks as if they came first. "
-        f"{channels_last_hint(env.env_id, env.observation_space, own_shape)} "
+        f"{channels_last_hint(env.env_id, env.observation_space, own_shape)}"
     )
+
+
+def _with_channels(spec: SweepSpec, env: EnvInfo, hint: str) -> str:
+    return " ".join(filter(None, (channels_hint(spec, env), hint)))
 
 
 def _has_channels_first(shape: Sequence[int]) -> bool:

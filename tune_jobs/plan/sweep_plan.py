@@ -17,17 +17,15 @@ from pydantic import TypeAdapter
 from analysis.numbering import planned_places
 from analysis.records import FINISHED, ChosenPointRecord, PriorRecord, ReplicationRecord, TrialPlan, TrialRecord
 from analysis.wording import counted
-from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo
-from policies.envs.masks import seen_by_networks
-from policies.envs.own_actions import Choices, is_made
-from policies.errors import MALFORMED, CannotRunError, SpecError, said_by, shortened
+from policies.errors import MALFORMED, CannotRunError, SpecError, said_by
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams
 from tune_jobs.plan.concurrency import max_concurrent
 from tune_jobs.plan.engine_choice import PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
+from tune_jobs.plan.env_notes import env_notes
 from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, trial_bytes
 from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
@@ -365,30 +363,7 @@ def _largest(
 
 def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
     """Return notes on the sweep; `concurrent` is how many trials run at once, or None if packs need no such note."""
-    notes = repeated_points_notes(spec)
-    seen = seen_by_networks(env.observation_space)
-    if isinstance(seen, FlatBox):
-        kind = "images of shape" if env.observes_images else "vectors of shape"
-        notes.append(f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}.")
-    if is_made(actions := env.action_space):
-        kind = f"{counted(len(actions.sizes), 'choice')}" if isinstance(actions, Choices) else "vectors"
-        notes.append(f"Actions of {env.env_id} are made of {kind}: {shortened(actions.original)}.")
-    if env.mask is not None:
-        notes.append(
-            f"Only actions that {env.env_id} allows, by {env.mask}, are drawn, learned and taken; networks do not see "
-            "the mask."
-        )
-    elif env.unused_mask is not None:
-        notes.append(
-            f"{env.env_id} gives info[{env.unused_mask!r}], which seems to say which actions are allowed, and which is "
-            "not used: env.action_mask: true uses it."
-        )
-    target = spec.stop.training_return
-    if env.threshold is not None and target is not None and target < env.threshold:
-        notes.append(
-            f"stop.training_return {target:g} is below {env.env_id}'s threshold {env.threshold:g}: "
-            "trials may end before they solve it."
-        )
+    notes = [*repeated_points_notes(spec), *env_notes(spec, env)]
     wanted = spec.resources.max_concurrent
     if (
         wanted is not None
