@@ -8,6 +8,8 @@ Shapes: K rows (networks), P weights per row.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
 from typing import Protocol
 
 import torch
@@ -15,6 +17,9 @@ from torch import Tensor
 
 _NUMBERS_AT_ONCE = 98_304
 """How many weights are moved at once: with their gradients, moments and quotients, they are two megabytes."""
+FUSED_FROM = 16_384
+"""The weights of a network from which on Adam is torch's own fused step, which goes over them once and not ten times.
+It is called for each member; networks with fewer are as fast all together."""
 
 
 class StackedOptimizer(Protocol):
@@ -49,18 +54,23 @@ class StackedAdam:
 
     def __init__(self, weights: Tensor, lr: Tensor, beta1: Tensor, beta2: Tensor, epsilon: Tensor) -> None:
         self.weights, self.lr = weights, lr
-        self._beta1, self._beta2, self._epsilon = beta1.double(), beta2.double(), epsilon
+        self.beta1, self.beta2, self.epsilon = beta1.double(), beta2.double(), epsilon
         self._weight1, self._beta2_32, self._weight2 = (1 - beta1).float(), beta2.float(), (1 - beta2).float()
         self.state = {"exp_avg": torch.zeros_like(weights), "exp_avg_sq": torch.zeros_like(weights)}
         self.num_steps = torch.zeros_like(lr, dtype=torch.float64)
         self._rates: list[tuple[Tensor, Tensor]] = []
+        # By the weights of one network alone: how many are in a stack has no part in how they are rounded.
+        self._fused = _FusedSteps(self) if weights.shape[1] >= FUSED_FROM and can_fuse(weights.device.type) else None
 
     def begin(self, num_updates: int) -> None:
         """Compute the rates of the next `num_updates` steps, with the present learning rates."""
+        if self._fused is not None:
+            self._fused.begin()
+            return
         counts = self.num_steps + torch.arange(num_updates, 0, -1, dtype=torch.float64, device=self.lr.device).view(
             -1, 1, 1
         )
-        correction1, correction2 = 1 - self._beta1**counts, 1 - self._beta2**counts
+        correction1, correction2 = 1 - self.beta1**counts, 1 - self.beta2**counts
         rates = (self.lr.double() / correction1).float()
         scales = correction2.rsqrt().float()
         # They are popped from the end of the list, so the first step comes last.
@@ -68,6 +78,10 @@ class StackedAdam:
 
     def step(self, gradients: Tensor) -> None:
         """Update the weights by one step of Adam."""
+        if self._fused is not None:
+            self._fused.step(gradients)
+            self.num_steps += 1
+            return
         if not self._rates:
             self.begin(1)
         rate, scale = self._rates.pop()
@@ -77,11 +91,71 @@ class StackedAdam:
             v.mul_(self._beta2_32)
             v.add_(gradient * gradient * self._weight2)
             denominator = v.sqrt()
-            denominator.mul_(scale).add_(self._epsilon)
+            denominator.mul_(scale).add_(self.epsilon)
             torch.div(m, denominator, out=denominator)
             denominator.mul_(rate)
             weights.sub_(denominator)
         self.num_steps += 1
+
+
+@dataclass(frozen=True)
+class _AlikeRows:
+    """Rows that one call may move, as they have the same settings."""
+
+    rows: list[int]
+    lr: float
+    beta1: float
+    beta2: float
+    epsilon: float
+
+
+class _FusedSteps:
+    """The steps of `torch.optim.Adam(fused=True)` on a CPU, each row with settings of its own."""
+
+    def __init__(self, adam: StackedAdam) -> None:
+        self._adam = adam
+        self._alike: list[_AlikeRows] = []
+        self._numbers = torch.zeros(len(adam.weights))  # of the step that is made, as the kernel takes them
+
+    def begin(self) -> None:
+        """Take the present learning rates and numbers of steps."""
+        adam = self._adam
+        columns = (adam.lr, adam.beta1, adam.beta2, adam.epsilon)
+        by_settings: dict[tuple[float, ...], list[int]] = {}
+        for row, settings in enumerate(zip(*(column[:, 0].tolist() for column in columns), strict=True)):
+            by_settings.setdefault(settings, []).append(row)
+        self._alike = [_AlikeRows(rows, *settings) for settings, rows in by_settings.items()]
+        self._numbers.copy_(adam.num_steps[:, 0])
+
+    def step(self, gradients: Tensor) -> None:
+        """Update the weights by one step."""
+        if not self._alike:
+            self.begin()
+        adam, self._numbers = self._adam, self._numbers + 1
+        tensors = (adam.weights, gradients, adam.state["exp_avg"], adam.state["exp_avg_sq"], self._numbers)
+        for alike in self._alike:
+            weights, grads, means, squares, numbers = ([tensor[row] for row in alike.rows] for tensor in tensors)
+            torch._fused_adam_(
+                weights, grads, means, squares, [], numbers,
+                lr=alike.lr, beta1=alike.beta1, beta2=alike.beta2, eps=alike.epsilon,
+                weight_decay=0.0, amsgrad=False, maximize=False,
+            )  # fmt: skip
+
+
+@cache
+def can_fuse(device: str) -> bool:
+    """Return whether torch has the fused step on a device; on CPUs since its version 2.4, on others it is not used."""
+    if device != "cpu":
+        return False
+    one = [torch.zeros(1)]
+    try:
+        torch._fused_adam_(
+            one, one, one, one, [], [torch.ones(1)], lr=0.0, beta1=0.0, beta2=0.0, eps=1.0,
+            weight_decay=0.0, amsgrad=False, maximize=False,
+        )  # fmt: skip
+    except (AttributeError, TypeError, RuntimeError):
+        return False
+    return True
 
 
 class StackedRMSprop:

@@ -185,8 +185,9 @@ def _silu(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _elu(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    negative = np.expm1(np.minimum(x, np.float32(0.0)))
-    return np.asarray(np.where(x > 0, x, negative), dtype=np.float32)
+    # Not by `np.where`, which takes four times as long; what is added is 0 on one side or the other.
+    below = np.expm1(np.minimum(x, np.float32(0.0)))
+    return np.asarray(np.maximum(x, np.float32(0.0)) + below, dtype=np.float32)
 
 
 def _gelu(x: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -16,9 +16,10 @@ from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import PPOHyperparams
+from policies.packed import optimizers
 from policies.packed.member import MAX_GROUP, group_members, network_layouts
 from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
-from policies.packed.optimizers import StackedAdam, StackedRMSprop, clip_by_global_norm
+from policies.packed.optimizers import FUSED_FROM, StackedAdam, StackedRMSprop, can_fuse, clip_by_global_norm
 from policies.packed.rows import StackedRows
 from policies.packed.sizes import is_padded_beside, size_class
 from tests.narrowing import present
@@ -209,15 +210,16 @@ def compare_with_torch(
     stacked: Callable[[torch.Tensor], StackedAdam | StackedRMSprop],
     make_separate: type[Adam | RMSprop],
     columns: Mapping[str, Sequence[float | tuple[float, float]]],
+    num_weights: int = NUM_WEIGHTS,
 ) -> None:
     """Two stretches of four steps beside torch.optim; row k has made 3 * k steps before."""
     rng = torch.Generator().manual_seed(0)
     settings = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-    first = torch.randn(len(settings), NUM_WEIGHTS, generator=rng)
+    first = torch.randn(len(settings), num_weights, generator=rng)
     rows = [Separate(make_separate, *pair) for pair in zip(first, settings, strict=True)]
     sizes = [Separate(make_separate, *pair, sizes=True) for pair in zip(first, settings, strict=True)]
     for index in range(len(rows)):
-        for gradient in torch.randn(3 * index, NUM_WEIGHTS, generator=rng):
+        for gradient in torch.randn(3 * index, num_weights, generator=rng):
             rows[index].step(gradient)
             sizes[index].step(gradient)
     weights = torch.stack([row.weight.detach().float() for row in rows])
@@ -230,7 +232,7 @@ def compare_with_torch(
         optimizer.begin(4)
         for _ in range(4):
             # Of sizes that differ as much as networks' gradients do.
-            gradients = torch.randn(len(rows), NUM_WEIGHTS, generator=rng) * torch.logspace(-5, 2, NUM_WEIGHTS)
+            gradients = torch.randn(len(rows), num_weights, generator=rng) * torch.logspace(-5, 2, num_weights)
             optimizer.step(gradients)
             for index, (row, size) in enumerate(zip(rows, sizes, strict=True)):
                 row.step(gradients[index])
@@ -250,16 +252,66 @@ def as_columns(values: Sequence[float], dtype: torch.dtype = torch.float32) -> t
     return torch.tensor(values, dtype=dtype)[:, None]
 
 
-def test_adam_is_torchs_row_by_row() -> None:
+@pytest.mark.parametrize("num_weights", [NUM_WEIGHTS, FUSED_FROM + 3])
+def test_adam_is_torchs_row_by_row(num_weights: int) -> None:
+    # The last row has the settings of the first: fused, one call moves both.
     values: dict[str, Any] = {
-        "lr": [1e-3, 0.02, 0.3], "betas": [(0.9, 0.999), (0.0, 0.99), (0.95, 0.9)], "eps": [1e-8, 1e-3, 0.5],
-    }  # fmt: skip
+        "lr": [1e-3, 0.02, 0.3, 1e-3],
+        "betas": [(0.9, 0.999), (0.0, 0.99), (0.95, 0.9), (0.9, 0.999)],
+        "eps": [1e-8, 1e-3, 0.5, 1e-8],
+    }
     beta1, beta2 = (as_columns([pair[at] for pair in values["betas"]], torch.float64) for at in (0, 1))
     compare_with_torch(
         lambda weights: StackedAdam(weights, as_columns(values["lr"]), beta1, beta2, as_columns(values["eps"])),
         torch.optim.Adam,
         values,
+        num_weights,
     )
+
+
+def test_wide_networks_take_the_fused_step_and_are_moved_alike_alone_and_beside_others() -> None:
+    assert can_fuse("cpu")
+    assert not can_fuse("cuda")
+    rng = torch.Generator().manual_seed(0)
+    columns = [as_columns(values) for values in ([1e-3, 1e-3, 0.1], [1e-8, 1e-8, 1e-3])]
+    betas = [as_columns(values, torch.float64) for values in ([0.9, 0.9, 0.5], [0.999, 0.999, 0.9])]
+    for num_weights in (FUSED_FROM - 1, FUSED_FROM, FUSED_FROM + 5):
+        first = torch.randn(3, num_weights, generator=rng)
+        gradients = torch.randn(6, 3, num_weights, generator=rng)
+
+        def moved(rows: slice, first: torch.Tensor = first, gradients: torch.Tensor = gradients) -> torch.Tensor:
+            weights = torch.stack(list(first[rows]))
+            adam = StackedAdam(weights, columns[0][rows], betas[0][rows], betas[1][rows], columns[1][rows])
+            assert (adam._fused is not None) == (first.shape[1] >= FUSED_FROM)
+            adam.num_steps += 4
+            adam.begin(4)
+            for number, gradient in enumerate(gradients):
+                if number == 4:
+                    adam.lr = adam.lr * 0.5
+                    adam.begin(2)
+                adam.step(gradient[rows])
+            return weights
+
+        together = moved(slice(0, 3))
+        for row in range(3):
+            assert torch.equal(moved(slice(row, row + 1))[0], together[row])
+
+
+def test_without_the_fused_step_adam_is_the_same_but_for_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = torch.Generator().manual_seed(1)
+    first, gradient = torch.randn(2, 2, FUSED_FROM, generator=rng).unbind()
+
+    def moved() -> torch.Tensor:
+        weights, column = first.clone(), torch.full((2, 1), 0.5)
+        adam = StackedAdam(weights, column * 0.02, column.double(), column.double(), column * 1e-8)
+        for _ in range(3):
+            adam.step(gradient)
+        return weights
+
+    fused = moved()
+    monkeypatch.setattr(optimizers, "can_fuse", lambda _: False)
+    # Three steps of 0.01 at most, ten operations each.
+    assert_rounded(moved(), fused, sizes=first.abs() + 0.03, num_roundings=2 * 30)
 
 
 @pytest.mark.parametrize("momentum", [[0.0, 0.0, 0.0], [0.9, 0.0, 0.5]])
