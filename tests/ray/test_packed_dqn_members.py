@@ -101,7 +101,7 @@ def test_a_member_does_not_depend_on_the_others(variant: str) -> None:
     assert alone.num_target_updates > 3
     packs = [in_pack(2, **shared), in_pack(11, changes=True, **shared), in_pack(5, head_start=2, **shared)]
     assert packs[0][2] == 1
-    assert packs[1][2] > 2
+    assert packs[1][2] > 1
     for packed, seen, _ in packs:
         for name, value in alone.weights.items():
             np.testing.assert_allclose(packed.weights[name], value, rtol=1e-4, atol=1e-4, err_msg=name)
