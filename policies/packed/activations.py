@@ -122,10 +122,13 @@ class StackedActivations:
         self._runs: Sequence[tuple[slice, Activation]] = runs
         self._one = runs[0][1] if len(runs) == 1 else None
         self._keeps_input = any(activation.keeps_input for _, activation in runs)
+        self._parts: dict[tuple[int, int], StackedActivations] = {}
 
     def part(self, start: int, stop: int) -> StackedActivations:
         """Return those of the networks from start to stop."""
-        return StackedActivations(self._names[start:stop])
+        if (start, stop) not in self._parts:  # each update of DQN asks for them
+            self._parts[start, stop] = StackedActivations(self._names[start:stop])
+        return self._parts[start, stop]
 
     def apply(self, x: Tensor) -> tuple[Tensor, Kept]:
         """Return the outputs, (K, ...), computed in place if they can be, and what `gradient` needs of them."""

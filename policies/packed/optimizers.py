@@ -65,7 +65,7 @@ class StackedAdam:
     def begin(self, num_updates: int) -> None:
         """Compute the rates of the next `num_updates` steps, with the present learning rates."""
         if self._fused is not None:
-            self._fused.begin()
+            self._fused.begin(num_updates)
             return
         counts = self.num_steps + torch.arange(num_updates, 0, -1, dtype=torch.float64, device=self.lr.device).view(
             -1, 1, 1
@@ -100,13 +100,12 @@ class StackedAdam:
 
 @dataclass(frozen=True)
 class _AlikeRows:
-    """Rows that one call may move, as they have the same settings."""
+    """Rows that one call moves, as they have the same settings."""
 
     rows: list[int]
-    lr: float
-    beta1: float
-    beta2: float
-    epsilon: float
+    state: list[list[Tensor]]
+    """The weights, the mean and the squared gradients, and the number of the step, of each row."""
+    settings: tuple[float, float, float, float]
 
 
 class _FusedSteps:
@@ -115,30 +114,36 @@ class _FusedSteps:
     def __init__(self, adam: StackedAdam) -> None:
         self._adam = adam
         self._alike: list[_AlikeRows] = []
+        self._num_left = 0
         self._numbers = torch.zeros(len(adam.weights))  # of the step that is made, as the kernel takes them
 
-    def begin(self) -> None:
-        """Take the present learning rates and numbers of steps."""
+    def begin(self, num_updates: int) -> None:
+        """Take the present learning rates and numbers of steps, for the next `num_updates` steps."""
         adam = self._adam
         columns = (adam.lr, adam.beta1, adam.beta2, adam.epsilon)
-        by_settings: dict[tuple[float, ...], list[int]] = {}
+        by_settings: dict[tuple[float, float, float, float], list[int]] = {}
         for row, settings in enumerate(zip(*(column[:, 0].tolist() for column in columns), strict=True)):
             by_settings.setdefault(settings, []).append(row)
-        self._alike = [_AlikeRows(rows, *settings) for settings, rows in by_settings.items()]
+        tensors = (adam.weights, adam.state["exp_avg"], adam.state["exp_avg_sq"], self._numbers)
+        self._alike = [
+            _AlikeRows(rows, [[tensor[row] for row in rows] for tensor in tensors], settings)
+            for settings, rows in by_settings.items()
+        ]
         self._numbers.copy_(adam.num_steps[:, 0])
+        self._num_left = num_updates
 
     def step(self, gradients: Tensor) -> None:
         """Update the weights by one step."""
-        if not self._alike:
-            self.begin()
-        adam, self._numbers = self._adam, self._numbers + 1
-        tensors = (adam.weights, gradients, adam.state["exp_avg"], adam.state["exp_avg_sq"], self._numbers)
+        if not self._num_left:
+            self.begin(1)
+        self._num_left -= 1
+        self._numbers += 1
         for alike in self._alike:
-            weights, grads, means, squares, numbers = ([tensor[row] for row in alike.rows] for tensor in tensors)
+            weights, means, squares, numbers = alike.state
+            lr, beta1, beta2, epsilon = alike.settings
             torch._fused_adam_(
-                weights, grads, means, squares, [], numbers,
-                lr=alike.lr, beta1=alike.beta1, beta2=alike.beta2, eps=alike.epsilon,
-                weight_decay=0.0, amsgrad=False, maximize=False,
+                weights, [gradients[row] for row in alike.rows], means, squares, [], numbers,
+                lr=lr, beta1=beta1, beta2=beta2, eps=epsilon, weight_decay=0.0, amsgrad=False, maximize=False,
             )  # fmt: skip
 
 

@@ -7,7 +7,6 @@ import pytest
 from packed_dqn import PHASES, ROUNDING, compare, differences
 
 from policies.activations import ACTIVATIONS
-from policies.packed.sizes import group_key
 from tests.narrowing import present
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
@@ -85,7 +84,8 @@ def test_all_activations_and_both_of_each_kind_have_a_pack() -> None:
 def test_training_phases_are_rllibs_for_every_member(name: str) -> None:
     shared, members = PACKS[name]
     pairs, stack = compare([{**shared, **values} for values in members])
-    assert len(stack._groups) == len({group_key(member.hyperparams) for member in stack.members})
+    # Whatever their activations: one of these has layers of another size.
+    assert len(stack._groups) == (2 if name == "squared, no target network" else 1)
     for ours, theirs in pairs:
         for what, value in differences(ours, present(theirs)).items():
             assert value < ROUNDING, what

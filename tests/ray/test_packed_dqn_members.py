@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
-# Of all kinds, so that the one that is watched stands alone in a group, or is padded with others in one.
+# Of all kinds, so that the one that is watched stands alone in a group, or is padded with others in one, of its
+# activation or another.
 OTHERS = [
     {"hidden_sizes": (size, size), "activation": activation, "lr": lr, "gamma": gamma, "replay_capacity": capacity}
     for size, activation, lr, gamma, capacity in (
         (20, "relu", 1e-3, 0.9, 100), (24, "relu", 1e-2, 0.99, 5000), (64, "tanh", 3e-4, 0.99, 100),
-        (22, "relu", 1e-3, 0.5, 900), (17, "relu", 3e-3, 1.0, 64), (24, "silu", 1e-3, 0.99, 100),
-        (23, "relu", 1e-4, 0.9, 700), (19, "relu", 5e-3, 0.9, 300), (18, "relu", 1e-3, 0.9, 50),
+        (22, "relu", 1e-3, 0.5, 900), (17, "relu", 3e-3, 1.0, 64), (40, "silu", 1e-3, 0.99, 100),
+        (23, "relu", 1e-4, 0.9, 700), (19, "silu", 5e-3, 0.9, 300), (18, "relu", 1e-3, 0.9, 50),
         (21, "relu", 1e-3, 0.8, 1000), (24, "relu", 2e-3, 0.95, 200),
     )
 ]  # fmt: skip
@@ -101,7 +102,7 @@ def test_a_member_does_not_depend_on_the_others(variant: str) -> None:
     assert alone.num_target_updates > 3
     packs = [in_pack(2, **shared), in_pack(11, changes=True, **shared), in_pack(5, head_start=2, **shared)]
     assert packs[0][2] == 1
-    assert packs[1][2] > 1
+    assert packs[1][2] > 2
     for packed, seen, _ in packs:
         for name, value in alone.weights.items():
             np.testing.assert_allclose(packed.weights[name], value, rtol=1e-4, atol=1e-4, err_msg=name)

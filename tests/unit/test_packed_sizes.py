@@ -85,6 +85,7 @@ def test_nor_do_the_activations_beside_it(activation: str, beside: str, hidden_s
     found = stack.gradients.clone()
     alone.weights.copy_(stack.weights[1:2])
     assert torch.equal(alone.forward(x[1:2]), outputs[1:2])
+    assert torch.equal(stack.evaluate(x[1:2], 1, 2), outputs[1:2])
     alone.backward(gradient[1:2])
     assert torch.equal(alone.gradients, found[1:2])
     few = x[..., :-1].numpy()
