@@ -6,11 +6,13 @@ warns when a module class cannot be imported or a key is missing, and continues 
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
@@ -82,6 +84,7 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     """Restore an RLlib checkpoint as an `Algorithm` that can continue training.
 
     RLlib's checkpoints are pickles: restore only what you trust. Callers check the manifest's hashes first.
+    What was trained on a GPU goes on on the CPU where PyTorch sees none.
 
     Args:
         rllib_checkpoint: The folder RLlib's `save_to_path` wrote.
@@ -95,7 +98,8 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
         import_module_class(expected.module.class_path)
     try:
         with old_names():
-            algorithm = Algorithm.from_checkpoint(str(rllib_checkpoint.absolute()))
+            place = str(rllib_checkpoint.absolute())
+            algorithm = Algorithm.from_checkpoint(place, **_settings_of_this_machine(rllib_checkpoint))
     except Exception as error:
         raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
     try:
@@ -113,6 +117,16 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
         algorithm.config = config
     _send_weights(algorithm)
     return algorithm
+
+
+def _settings_of_this_machine(rllib_checkpoint: Path) -> dict[str, Any]:
+    """Return the config to restore a checkpoint with, if it can't be the saved one as that asks for a GPU."""
+    if torch.cuda.is_available():
+        return {}
+    # What RLlib itself makes the Algorithm of.
+    made_of = pickle.loads((rllib_checkpoint / Algorithm.CLASS_AND_CTOR_ARGS_FILE_NAME).read_bytes())  # noqa: S301
+    (saved,), _ = made_of["ctor_args_and_kwargs"]
+    return {"config": {**saved, "num_gpus_per_learner": 0}} if saved["num_gpus_per_learner"] else {}
 
 
 def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: PolicyNetwork) -> None:

@@ -1,8 +1,10 @@
 """A checkpoint restores to the very weights that were saved, or raises; portable policies act as RLlib does."""
 
 import json
+import pickle
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +18,7 @@ from trials import make_task, run_trial
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
 from policies.activations import ACTIVATIONS
-from policies.errors import CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.hyperparams import Algorithm, TrainedHyperparams, make_hyperparams
 from policies.packed.member import Weights
 from policies.portable.file import Layer, PolicyNetwork, read_policy, save_policy
@@ -145,6 +147,30 @@ def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint
     (checkpoint / "rllib" / "class_and_ctor_args.pkl").unlink()
     with pytest.raises(CheckpointError, match="RLlib cannot restore"):
         restore_algorithm(checkpoint / "rllib")
+
+
+def test_a_checkpoint_that_was_trained_on_a_gpu_is_restored_where_there_is_none(checkpoint: Path) -> None:
+    """Told by what RLlib makes the Algorithm of; weights and moments are NumPy's in it, wherever they were trained."""
+    from policies.rllib.restore import restore_algorithm
+
+    assert not torch.cuda.is_available()
+    file = checkpoint / "rllib" / "class_and_ctor_args.pkl"
+    made_of = pickle.loads(file.read_bytes())
+    made_of["ctor_args_and_kwargs"][0][0]["num_gpus_per_learner"] = 0.25
+    file.write_bytes(pickle.dumps(made_of))
+    algo = restore_algorithm(checkpoint / "rllib", read_policy(checkpoint).network)
+    assert algo.config.num_gpus_per_learner == 0
+    assert algo.train()["training_iteration"] == 3
+    algo.stop()
+
+
+def test_a_trial_with_a_gpu_is_not_restored_on_the_cpu(checkpoint: Path, tmp_path: Path) -> None:
+    """A trial that goes on where PyTorch sees no GPU has to fail: it would go on many times slower, and unnoticed."""
+    from tune_jobs.training.rllib import RLlibEngine
+
+    task = replace(make_task(tmp_path / "sweep"), num_gpus=0.25)
+    with pytest.raises(CannotRunError, match=r"num_gpus is 0\.25"):
+        RLlibEngine().build(task, checkpoint)
 
 
 @pytest.mark.parametrize("part", ["weight", "bias"])

@@ -57,7 +57,7 @@ def refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
             )
         raise CannotRunError(
             f"{needs}; {machine.source} has {machine.num_gpus:g}. {FOR_EVER}",
-            "Set resources.num_gpus to 0, or launch on a cluster with GPUs with --address.",
+            "Set resources.num_gpus to 0 before the launch, or take a machine, or with --address a cluster, with GPUs.",
         )
     main = cpus - runners
     if machine.nodes and not any(main <= node_cpus and gpus <= node_gpus for node_cpus, node_gpus in machine.nodes):

@@ -74,6 +74,8 @@ class RLlibEngine:
         # The values were validated with the sweep file; this turns JSON back into the typed object.
         # A baseline has an engine of its own.
         hyperparams = cast("TrainedHyperparams", make_hyperparams(cast("Algorithm", task.algorithm), task.hyperparams))
+        # RLlib would say so in its own words, after seconds, or not at all; and a restore would go on on the CPU.
+        device_for(task.num_gpus)
         self._task, self._hyperparams = task, hyperparams
         self._before = (0, 0)
         saved = None if checkpoint is None else read_policy(checkpoint)
@@ -89,8 +91,6 @@ class RLlibEngine:
             self._continue_streams(checkpoint)
 
     def _new_algorithm(self, task: TrialTask, hyperparams: TrainedHyperparams) -> RLlibAlgorithm:
-        # RLlib would say so in its own words, after seconds, or not at all.
-        device_for(task.num_gpus)
         config = build_algorithm_config(
             hyperparams,
             env_id=task.env_id,
