@@ -19,13 +19,15 @@ from numpy.typing import NDArray
 
 from policies.acting.classic_players import CartPolePlayer, RowsPlayer, Starts
 from policies.acting.policy import Action, NetworkPolicy, Policy
-from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
+from policies.acting.running import Running, step_together
+from policies.envs import calls
 from policies.envs.classic_rows import ClassicRows
-from policies.envs.faults import close_env, env_failed
+from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices
-from policies.errors import EnvError, EnvFailedError, SpecError
+from policies.envs.runners import Runners, is_runner
+from policies.errors import EnvError, SpecError
 
 EndedBy = Literal["terminated", "truncated", "cap"]
 """How an episode ended: in a state that ends it, by a limit of the env, or at the cap on its steps."""
@@ -110,6 +112,8 @@ class Evaluator:
         self._classic = (
             None if self._cartpoles else RowsPlayer.make_if_classic(self._envs[0], env_id, self.env_args, self.seeds)
         )
+        runners = Runners.of(env_id, self.env_args) if is_runner(self._envs[0]) else None
+        self._runners = None if runners is None else calls.watch_steps(runners)
 
     @property
     def starts(self) -> Starts | None:
@@ -158,6 +162,8 @@ class Evaluator:
             close_env(env)
         if self._classic is not None:
             self._classic.close()
+        if self._runners is not None:
+            self._runners.close()
 
     def __enter__(self) -> Self:
         return self
@@ -174,16 +180,23 @@ class Evaluator:
             self._envs.append(make_env(self.env_id, self.env_args))
         waiting = deque(enumerate(self.seeds))
         results: dict[int, tuple[float, int]] = {}
-        running = [_Running(env, *waiting.popleft()) for env in self._envs[: len(self.seeds)]]
+        running = [Running(env, *waiting.popleft()) for env in self._envs[: len(self.seeds)]]
         while running:
             actions = policy.act_on_rows(np.stack([episode.observation for episode in running]))
-            for episode, action in zip(running, actions, strict=True):
-                if episode.step(action) or episode.length >= self.max_episode_steps:
+            for episode, has_ended in zip(running, self._step(policy, running, actions), strict=True):
+                if has_ended or episode.length >= self.max_episode_steps:
                     results[episode.index] = (episode.total, episode.length)
             ended = [episode for episode in running if episode.index in results]
             running = [episode for episode in running if episode.index not in results]
-            running += [_Running(episode.env, *waiting.popleft()) for episode in ended if waiting]
+            running += [Running(episode.env, *waiting.popleft()) for episode in ended if waiting]
         return [results[index] for index in range(len(self.seeds))]
+
+    def _step(self, policy: Policy, running: Sequence[Running], actions: Any) -> list[bool]:
+        """Step episodes and return which of them have ended."""
+        # Another may give actions of other types or outside of their bounds, which is the environment's to judge.
+        if self._runners is not None and type(policy) is NetworkPolicy:
+            return step_together(self._runners, running, actions)
+        return [episode.step(action) for episode, action in zip(running, actions, strict=True)]
 
 
 def evaluate_policy(
@@ -238,7 +251,7 @@ def episode_steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, max_epis
     """
     if isinstance(policy, Resettable):
         policy.reset(seed)
-    episode = _Running(env, 0, seed)
+    episode = Running(env, 0, seed)
     ended_by: EndedBy | None = None
     yield Moment(0, 0.0, None, None, ended_by)
     while ended_by is None:
@@ -310,71 +323,3 @@ def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
     if max_episode_steps < 1:
         raise EnvError(f"The cap on episode steps is {max_episode_steps}.", "Use a cap of 1 or more, or none.")
     return max_episode_steps
-
-
-class _Running:
-    """An episode that is being played in a scalar environment."""
-
-    def __init__(self, env: gym.Env[Any, Any], index: int, seed: int) -> None:
-        self.env, self.index, self.seed = env, index, seed
-        self.length = 0
-        self.total = 0.0
-        self.has_terminated = False
-        self._space = env.observation_space
-        try:
-            observation, _ = env.reset(seed=seed)
-        except BaseException as error:  # an env may raise anything
-            raise self._env_failed("reset", error) from error
-        self.observation = self._as_numbers(observation)
-        check_observation(self.observation, self._env_id, 0, self._space)
-
-    def step(self, action: Any) -> bool:
-        """Step once and return whether the episode has ended."""
-        # As RLlib sends it: NumPy scalars for Discrete actions fail `isinstance(action, int)` in some envs.
-        if isinstance(action, np.generic):
-            action = action.item()
-        try:
-            observation, reward, terminated, truncated, _ = self.env.step(action)
-            self.length += 1
-            reward = reward_as_number(reward)
-            self.total += reward
-        except BaseException as error:  # an env may raise anything
-            raise self._env_failed("step", error) from error
-        self.observation = self._as_numbers(observation)
-        if not (math.isfinite(reward) and is_sound(self.observation)):
-            check_reward(reward, self._env_id, self.length)
-            check_observation(self.observation, self._env_id, self.length, self._space)
-        self.has_terminated = bool(terminated)
-        return bool(terminated or truncated)
-
-    def _as_numbers(self, observation: Any) -> NDArray[Any]:
-        """Return an observation as an array, not copied.
-
-        Raises:
-            EnvFailedError: It is something other than numbers of the space's shape.
-        """
-        try:
-            array = np.asarray(observation)
-        except Exception:  # noqa: BLE001 (ragged lists, say)
-            array = np.empty(0, dtype=object)
-        if array.dtype.kind in "biuf" and array.shape == self._space.shape:
-            return array
-        method = "step" if self.length else "reset"
-        which = f"after env step {self.length}" if self.length else "from reset(), at the beginning"
-        what = "None" if observation is None else f"of shape {array.shape} and dtype {array.dtype}"
-        raise EnvFailedError(
-            f"The observation {which} of the episode of {self._env_id} with seed {self.seed} was {what}, not numbers "
-            f"of shape {self._space.shape}.",
-            f"Mend its {method}(): each observation must be of the observation space.",
-        )
-
-    @property
-    def _env_id(self) -> str:
-        return self.env.spec.id if self.env.spec is not None else type(self.env.unwrapped).__name__
-
-    def _env_failed(self, method: str, error: BaseException) -> EnvFailedError:
-        return env_failed(
-            f"{self._env_id} raised an error in {method}() of the episode with seed {self.seed}, after {self.length} "
-            "steps",
-            error,
-        )

@@ -151,6 +151,11 @@ def watch_rows(rows: _Watched) -> _Watched:
     return _watch(rows, {"start": Call.RESET, "step": Call.STEP})
 
 
+def watch_steps(runners: _Watched) -> _Watched:
+    """Have what steps several environments at once write its steps to the page, if this process is watched."""
+    return _watch(runners, {"step": Call.STEP})
+
+
 def watch_policy(policy: _Watched) -> _Watched:
     """Have a policy write its calls to the page, if this process is watched."""
     # One of them may call another, as those of a class of the user's own do: that is a call inside a call.

@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from numpy.typing import NDArray
 
 from policies.envs.classic import Physics, physics_of
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
+from policies.envs.plain import is_plain
 
-_PLAIN = (TimeLimit, OrderEnforcing)
 _COMPARED_STEPS = 40
 
 
@@ -61,7 +60,7 @@ class ClassicRows:
             EnvError: In the same cases as `policies.envs.make.make_env`.
         """
         env = make_env(env_id, env_args)
-        physics = physics_of(env.unwrapped) if _is_plain(env) else None
+        physics = physics_of(env.unwrapped) if is_plain(env) else None
         if physics is None or not _steps_alike(env.unwrapped, physics):
             close_env(env)
             return None
@@ -112,13 +111,6 @@ class ClassicRows:
     def close(self) -> None:
         """Close the environment."""
         close_env(self._env)
-
-
-def _is_plain(env: gym.Env[Any, Any]) -> bool:
-    """Whether nothing but Gymnasium's time limit is around an environment."""
-    while type(env) in _PLAIN:
-        env = env.env  # type: ignore[attr-defined]
-    return env is env.unwrapped
 
 
 def _steps_alike(env: gym.Env[Any, Any], physics: Physics) -> bool:

@@ -29,14 +29,8 @@ from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
 from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_by_networks
-from policies.envs.own_actions import (
-    Choices,
-    TakesActions,
-    UnsupportedActionsError,
-    is_taken,
-    made_of,
-    sizes_of,
-)
+from policies.envs.mujoco_warnings import say_each_once
+from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of, sizes_of
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
@@ -252,6 +246,7 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
         env_id, spec = find_env(env_id)
         wrappers = ObservationWrappers.take_from(kwargs)
         _check_args(env_id, spec, kwargs)
+    say_each_once()
     return env_id, spec, kwargs, wrappers
 
 

@@ -16,7 +16,8 @@ from policies.child_processes import entry
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules, allowed_modules
 from policies.errors import EnvError
-from policies.packed.envs.sub_envs import HostDiedError, SubEnvs
+from policies.packed.envs.runner_sub_envs import make_sub_envs
+from policies.packed.envs.sub_envs import HostDiedError
 from policies.parents import end_with_parent
 
 _PATIENCE_S = 5.0
@@ -100,7 +101,7 @@ def serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     note_signals()
     allow_modules(modules)
-    sub_envs = SubEnvs(env_id, env_args)
+    sub_envs = make_sub_envs(env_id, env_args)
     while True:
         try:
             asked = connection.recv()
