@@ -61,8 +61,8 @@ def imported(folder: Path, names: Sequence[str] | set[str]) -> set[str]:
                 tops.add(ast.literal_eval(node.args[0]).partition(".")[0])
     local = {path.stem for path in (folder / "tests").rglob("*.py")} | {"tests"} | OWN
     others = sorted(tops - sys.stdlib_module_names - local)
-    # An extra that is not installed here is not in what Python knows of its packages.
-    known = {"sklearn": ["scikit-learn"], **packages_distributions()}
+    # An extra that is not installed here is not in what Python knows of its packages; MuJoCo's is in several parts.
+    known = {"sklearn": ["scikit-learn"], **packages_distributions(), "mujoco": ["mujoco"]}
     return {normal(known[top][0]) if top in known else normal(top) for top in others}
 
 
