@@ -149,11 +149,13 @@ def test_an_rllib_checkpoint_without_its_algorithms_state_is_an_error(checkpoint
         restore_algorithm(checkpoint / "rllib")
 
 
-def test_a_checkpoint_that_was_trained_on_a_gpu_is_restored_where_there_is_none(checkpoint: Path) -> None:
+def test_a_checkpoint_that_was_trained_on_a_gpu_is_restored_where_there_is_none(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Told by what RLlib makes the Algorithm of; weights and moments are NumPy's in it, wherever they were trained."""
     from policies.rllib.restore import restore_algorithm
 
-    assert not torch.cuda.is_available()
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     file = checkpoint / "rllib" / "class_and_ctor_args.pkl"
     made_of = pickle.loads(file.read_bytes())
     made_of["ctor_args_and_kwargs"][0][0]["num_gpus_per_learner"] = 0.25
@@ -164,8 +166,11 @@ def test_a_checkpoint_that_was_trained_on_a_gpu_is_restored_where_there_is_none(
     algo.stop()
 
 
-def test_a_trial_with_a_gpu_is_not_restored_on_the_cpu(checkpoint: Path, tmp_path: Path) -> None:
+def test_a_trial_with_a_gpu_is_not_restored_on_the_cpu(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A trial that goes on where PyTorch sees no GPU has to fail: it would go on many times slower, and unnoticed."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     from tune_jobs.training.rllib import RLlibEngine
 
     task = replace(make_task(tmp_path / "sweep"), num_gpus=0.25)
