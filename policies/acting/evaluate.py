@@ -26,7 +26,7 @@ from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices
-from policies.envs.runners import Runners, is_runner
+from policies.envs.runners import Runners
 from policies.errors import EnvError, SpecError
 
 EndedBy = Literal["terminated", "truncated", "cap"]
@@ -112,7 +112,7 @@ class Evaluator:
         self._classic = (
             None if self._cartpoles else RowsPlayer.make_if_classic(self._envs[0], env_id, self.env_args, self.seeds)
         )
-        runners = Runners.of(env_id, self.env_args) if is_runner(self._envs[0]) else None
+        runners = Runners.of(env_id, self.env_args)
         self._runners = None if runners is None else calls.watch_steps(runners)
 
     @property

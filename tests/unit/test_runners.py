@@ -13,6 +13,7 @@ from policies.acting.evaluate import Evaluator, play_episode
 from policies.acting.policy import NetworkPolicy
 from policies.envs.make import make_env
 from policies.envs.runners import Copy, Runners
+from policies.packed.envs.make import make_packed_envs
 from policies.packed.envs.runner_sub_envs import RunnerSubEnvs, make_sub_envs
 from policies.packed.envs.sub_envs import SubEnvs, SubStep
 from policies.portable.file import Layer, PolicyNetwork, PortablePolicy, describe_space
@@ -103,6 +104,32 @@ def test_a_robot_has_fallen_where_gymnasium_says_so(env_id: str, args: dict[str,
         theirs.append(inner.is_healthy)
     assert ours.tolist() == theirs
     assert 40 < sum(theirs) < num - 40
+
+
+def test_processes_step_robots_as_this_one_does() -> None:
+    here, there = (
+        make_packed_envs("Hopper-v5", None, 3, kind=kind, num_processes=2) for kind in ("scalar", "processes")
+    )
+    for envs in (here, there):
+        envs.add("m", 5)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        actions = rng.uniform(-1, 1, (3, 3)).astype(np.float32)
+        ours, theirs = there.step(actions), here.step(actions)
+        np.testing.assert_array_equal(ours.observations, theirs.observations, strict=True)
+        np.testing.assert_array_equal(ours.rewards, theirs.rewards, strict=True)
+    here.close()
+    there.close()
+
+
+def test_no_environment_but_a_robot_is_made_to_look_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user's may take seconds to make, or end the process; its members are told so when they are added."""
+
+    made: list[str] = []
+    monkeypatch.setattr("policies.envs.runners.make_env", lambda env_id, _: made.append(env_id))
+    for env_id in ("CartPole-v1", "Ant-v5", "nowhere:Env"):
+        assert type(make_sub_envs(env_id, {})) is SubEnvs
+    assert not made
 
 
 def test_robots_fall_in_these_tests() -> None:

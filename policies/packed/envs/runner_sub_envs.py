@@ -16,11 +16,7 @@ from policies.packed.envs.sub_envs import SubEnvs, SubStep, find_unsound
 
 
 def make_sub_envs(env_id: str, env_args: Mapping[str, Any] | None) -> SubEnvs:
-    """Return scalar environments of several members, none yet, stepped together if they can be.
-
-    Raises:
-        EnvError: In the same cases as `policies.envs.make.make_env`.
-    """
+    """Return scalar environments of several members, none yet, stepped together if they can be."""
     runners = Runners.of(env_id, env_args)
     return SubEnvs(env_id, env_args) if runners is None else RunnerSubEnvs(env_id, env_args, runners)
 
@@ -42,7 +38,7 @@ class RunnerSubEnvs(SubEnvs):
     @override
     def add(self, member_id: str, seeds: Sequence[int]) -> list[NDArray[Any]]:
         observations = super().add(member_id, seeds)
-        self._copies = [Copy(one.env) for one in self._envs]
+        self._copies += [Copy(one.env) for one in self._envs[len(self._copies) :]]
         return observations
 
     @override
