@@ -7,6 +7,7 @@ deviation, and every fifth point at random. The trees are scikit-learn's.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -39,13 +40,12 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
 
     rng = random_streams.model_draws(question.seed, question.index)
     if rng.random() < _RANDOM_SHARE:
-        try:
-            point = draw_point(question.space, question.index, question.seed)
-            check(point)
-        except SpecError:
-            pass
-        else:
-            return point
+        point = draw_point(question.space, question.index, question.seed)
+        # One that was tried is no look at anything new, where a space is small.
+        if all(item.point != point for item in question.known):
+            with suppress(SpecError):
+                check(point)
+                return point
     cube = Cube(question.space)
     seen, units = observed(cube, question.known, _MOST_GIVEN)
     forest = RandomForestRegressor(_NUM_TREES, random_state=int(rng.integers(2**31)))

@@ -12,7 +12,7 @@ from analysis.records import ChosenPointRecord
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams
 from tune_jobs.spec.domains import Domain, Layers, Listed, Range
-from tune_jobs.spec.draws import draw_point, draw_points
+from tune_jobs.spec.draws import draw_first_points, draw_points
 from tune_jobs.spec.hyperparam_problems import as_taken
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -46,8 +46,7 @@ def _drawn_points(spec: SweepSpec) -> list[dict[str, Any] | None]:
         return list(draw_points(spec.space, spec.num_samples, spec.seed))
     # With a prior the model may propose from the first on; one point is known, from which sizes are estimated.
     num_random = min(1 if spec.prior else spec.search.num_startup_trials, spec.num_samples)
-    known = [draw_point(spec.space, index, spec.seed) for index in range(num_random)]
-    return [*known, *[None] * (spec.num_samples - num_random)]
+    return [*draw_first_points(spec.space, num_random, spec.seed), *[None] * (spec.num_samples - num_random)]
 
 
 def largest_hyperparams(spec: SweepSpec, known: Sequence[Hyperparams]) -> list[Hyperparams]:

@@ -25,6 +25,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from analysis.points import meaning_of
 from analysis.records import PriorRecord, TrialRecord
 from policies import random_streams
 from policies.errors import CannotRunError, SpecError
@@ -101,7 +102,7 @@ def propose_point(
 
     The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, or all
     that have are equally good, the point is the random one of its index, or another random one where its values
-    contradict each other.
+    contradict each other or were tried before.
 
     Args:
         spec: The sweep.
@@ -154,10 +155,8 @@ def next_point(
     """
     check_installed(method)
     if method == "random":
-        return draw_point(space, index, seed)
-    if sum(not point.is_running for point in known) < num_startup_trials:
-        return _valid_draw(space, index, seed, check)
-    if _are_all_equal(known):
+        return _new_draw(space, known, index, seed, lambda _: None)
+    if sum(not point.is_running for point in known) < num_startup_trials or _are_all_equal(known):
         return _new_draw(space, known, index, seed, check)
     propose, parts = _METHODS[method].load(), Parts(space)
     if parts.are_the_same:
@@ -201,12 +200,12 @@ def _new_draw(
     space: Mapping[str, Domain], known: Sequence[KnownPoint], index: int, seed: int, check: Check
 ) -> dict[str, Any]:
     """Return the random point of an index, or the next of its stream that is valid and was not tried before."""
-    tried = [item.point for item in known]
+    tried = {meaning_of(item.point) for item in known}
 
     def check_new(point: dict[str, Any]) -> None:
-        check(point)
-        if point in tried:
+        if meaning_of(point) in tried:
             raise SpecError("It was tried before.")
+        check(point)
 
     try:
         return _valid_draw(space, index, seed, check_new)

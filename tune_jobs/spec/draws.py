@@ -1,11 +1,18 @@
-"""Draw the points of a sweep: every combination of the grids' values, and random values of the other domains."""
+"""Draw the points of a sweep: every combination of the grids' values, and random values of the other domains.
+
+No point is drawn twice while there are others: what was drawn before is drawn again, by the same generator. Lists have
+few points, and of 20 independent draws of 24 points a third would be trainings of what is known. Other tools draw
+independently.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from policies import random_streams
 from tune_jobs.spec.conditions import Conditions, in_order
@@ -13,6 +20,8 @@ from tune_jobs.spec.domains import Domain, Grid
 
 MOST_COMBINATIONS = 1_000_000
 """Of grids with conditions, more than these are not counted; no sweep can have as many."""
+_MOST_DRAWS = 200
+"""So many draws of nothing but what is known, and there are hardly any others."""
 
 
 def num_points(space: Mapping[str, Domain], num_samples: int, *, most: int = MOST_COMBINATIONS) -> int:
@@ -24,8 +33,9 @@ def num_points(space: Mapping[str, Domain], num_samples: int, *, most: int = MOS
 def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) -> list[dict[str, Any]]:
     """Draw the points of a sweep: for each sample, one for each combination of the grids' values.
 
-    The random values of point i come from a generator of their own, so a point depends on the space, the
-    sweep seed and its own index alone: a larger `num_samples` appends points and changes none.
+    The random values of point i come from a generator of their own, and are drawn again if an earlier point has them
+    all, so a point depends on the space, the sweep seed and earlier points alone: a larger `num_samples` appends points
+    and changes none. Once a combination has hardly any others, all of its points may come a second time, and so on.
 
     Args:
         space: Domains by hyperparameter. Their order is the order of the grid (the last one varies fastest). A grid
@@ -45,15 +55,22 @@ def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) 
             dict(zip(grids, values, strict=True))
             for values in itertools.product(*(grid.values for grid in grids.values()))
         ]
-    conditions = Conditions(space)
-    return [
-        _drawn(space, conditions, index, sweep_seed, combination)
-        for index, combination in enumerate(combinations * num_samples)
-    ]
+    return _all_different(space, combinations * num_samples, sweep_seed, len(combinations))
+
+
+def draw_first_points(space: Mapping[str, Domain], number: int, sweep_seed: int) -> list[dict[str, Any]]:
+    """Draw so many points, different as those of `draw_points`; values of grids are drawn like those of choices.
+
+    Args:
+        space: Domains by hyperparameter.
+        number: How many.
+        sweep_seed: Seed of the sweep, at least 0.
+    """
+    return _all_different(space, [None] * number, sweep_seed, 1)
 
 
 def draw_point(space: Mapping[str, Domain], index: int, sweep_seed: int) -> dict[str, Any]:
-    """Draw only point `index`; values of grids are drawn like those of choices.
+    """Draw only point `index`, whatever the others are; values of grids are drawn like those of choices.
 
     Args:
         space: Domains by hyperparameter.
@@ -69,13 +86,52 @@ def draw_all(space: Mapping[str, Domain], index: int, sweep_seed: int) -> dict[s
     return {name: domain.sample(rng) for name, domain in space.items()}
 
 
-def _drawn(
-    space: Mapping[str, Domain], conditions: Conditions, index: int, sweep_seed: int, combination: Mapping[str, Any]
+def _all_different(
+    space: Mapping[str, Domain], combinations: Sequence[Mapping[str, Any] | None], sweep_seed: int, num_groups: int
+) -> list[dict[str, Any]]:
+    """Draw a point for each combination of the grids' values; None: values of grids are drawn, too.
+
+    Each `num_groups` of them repeat those before.
+    """
+    conditions = Conditions(space)
+    known: list[set[str]] = [set() for _ in range(num_groups)]
+    points = []
+    for index, combination in enumerate(combinations):
+        rng, seen = random_streams.point_values(sweep_seed, index), known[index % num_groups]
+        points.append(_unseen(space, conditions, rng, combination, seen))
+    return points
+
+
+def _unseen(
+    space: Mapping[str, Domain],
+    conditions: Conditions,
+    rng: np.random.Generator,
+    combination: Mapping[str, Any] | None,
+    seen: set[str],
 ) -> dict[str, Any]:
-    rng = random_streams.point_values(sweep_seed, index)
+    """Draw a point that is not among those seen, and add it; if there are hardly any others, forget these first."""
+    first = point = _drawn(space, conditions, rng, combination)
+    if combination is not None and not any(space[name].is_random for name in first):
+        return first
+    for _ in range(_MOST_DRAWS):
+        if (key := repr(point)) not in seen:
+            seen.add(key)
+            return point
+        point = _drawn(space, conditions, rng, combination)
+    seen.clear()
+    seen.add(repr(first))
+    return first
+
+
+def _drawn(
+    space: Mapping[str, Domain],
+    conditions: Conditions,
+    rng: np.random.Generator,
+    combination: Mapping[str, Any] | None,
+) -> dict[str, Any]:
     values = {}
     for name, domain in space.items():
-        if isinstance(domain, Grid):
+        if combination is not None and isinstance(domain, Grid):
             if name in combination:
                 values[name] = combination[name]
         else:

@@ -279,7 +279,9 @@ class SweepFields(Section):
     hyperparams: dict[str, Any] = Field(default_factory=dict, description="Fixed hyperparameters.")
     space: dict[str, Domain] = Field(default_factory=dict, description="Searched hyperparameters.")
     num_samples: PositiveWhole = Field(
-        1, description="Random draws for each combination of the grids' values; with a search by a model: points."
+        1,
+        description="Random draws for each combination of the grids' values, no point twice while there are others; "
+        "with a search by a model: points.",
     )
     points: tuple[dict[str, Any], ...] = Field(
         (),
