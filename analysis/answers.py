@@ -9,7 +9,7 @@ from typing import Literal
 
 from analysis.best_records import BestRecord, SettingsRecord
 from analysis.records import Objective, SweepRecord, TrialRecord
-from analysis.wording import counted, return_text
+from analysis.wording import counted, range_text, return_text
 
 _MEANS: dict[Objective, str] = {
     "final": "in the later half of training",
@@ -24,11 +24,11 @@ def setting_score(settings: SettingsRecord) -> str:
     best = settings.best
     # Fewer env steps are better, so that they are scored below zero.
     sign = -1.0 if settings.objective == "steps_to_threshold" else 1.0
-    said = return_text if sign > 0 else _steps_text
-    parts = [f"{said(sign * best.score)} {_MEANS[settings.objective]}"]
+    parts = [f"{return_text(best.score) if sign > 0 else _steps_text(-best.score)} {_MEANS[settings.objective]}"]
     if best.lower is not None and best.upper is not None:
         low, high = sorted((sign * best.lower, sign * best.upper))
-        parts[0] += f" ({said(low)} to {said(high)} with 95 %, over training seeds)"
+        ends = range_text(low, high) if sign > 0 else f"{_steps_text(low)} to {_steps_text(high)}"
+        parts[0] += f" ({ends} with 95 %, over training seeds)"
     if best.num_solved is not None:
         parts.append(f"{best.num_solved} of {counted(len(best.scores), 'seed')} solved it in training")
     if best.num_failed:

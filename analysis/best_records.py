@@ -193,7 +193,7 @@ class BestRecord(Record):
             "chosen by": f"{return_text(self.selection_score)} mean evaluation return"
             + (f" over {self.choice.winner.num_episodes:,} episodes" if self.choice is not None else ""),
             "confirmed at": f"{return_text(confirmed.mean_return)} over {confirmed.num_episodes} fresh episodes; "
-            f"gap {difference_text(self.optimism_gap)}",
+            f"gap {difference_text(self.optimism_gap, confirmed.mean_return)}",
             "random policy": return_text(self.random.mean_return),
         }
         if confirmed.solved is not None:

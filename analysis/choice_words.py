@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from analysis.best_records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
 from analysis.statistics import mean_with_ci
 from analysis.successive_rejects import TIED
-from analysis.wording import NONE, counted, interval_text, return_text
+from analysis.wording import NONE, counted, interval_text, range_text, return_text
 from policies import random_streams
 
 COLUMNS = ("policy", "episodes", "score", "95 % interval", "confirmed at", "rejected")
@@ -60,12 +60,9 @@ def candidate_rows(best: BestRecord, *, none: str = NONE) -> list[CandidateRow]:
 
 def _row(item: CandidateRecord, best: BestRecord, none: str) -> CandidateRow:
     won = item.rejected_in is None
-    known = item.lower is not None and item.upper is not None
     interval = none
-    if known and item.lower == item.upper:
-        interval = "all equal"
-    elif known:
-        interval = f"{return_text(item.lower)} to {return_text(item.upper)}"
+    if item.lower is not None and item.upper is not None:
+        interval = "all equal" if item.lower == item.upper else range_text(item.lower, item.upper)
     return CandidateRow(
         f"{item.checkpoint.trial_id} at {item.checkpoint.num_env_steps:,}",
         f"{item.num_episodes:,}" if item.num_episodes else none,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.statistics import has_collapsed
-from analysis.wording import counted, return_text
+from analysis.wording import counted, range_text
 
 SHARE = 0.5
 """A trial collapsed if its last evaluation lost more than this share of what its best one had gained."""
@@ -110,7 +110,7 @@ def collapses_text(found: Sequence[Collapse], num_trainings: int) -> str:
     """
     if not found:
         return ""
-    named = [f"{item.trial_id} from {return_text(item.best)} to {return_text(item.last)}" for item in found]
+    named = [f"{item.trial_id} from {range_text(item.best, item.last)}" for item in found]
     more = f" and {len(named) - _MAX_NAMED:,} more" if len(named) > _MAX_NAMED else ""
     who = ", ".join(named[:_MAX_NAMED]) + more
     return f"{len(found):,} of {counted(num_trainings, 'training')} collapsed: {who} (best and last evaluation)"

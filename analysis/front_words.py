@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from analysis.best_records import FrontPointRecord, FrontRecord
-from analysis.wording import counted, number, return_text, setting_text
+from analysis.wording import counted, number, range_text, return_text, setting_text
 
 ON_FRONT, MAY_BE = "yes", "may be"
 NEAREST = "yes, the cheapest near the best"
@@ -41,7 +41,7 @@ def interval_text(item: FrontPointRecord, none: str) -> str:
     """Return the 95 % interval of a setting's score over training seeds."""
     if item.lower is None or item.upper is None:
         return none
-    return f"{return_text(item.lower)} to {return_text(item.upper)}"
+    return range_text(item.lower, item.upper)
 
 
 def cheapest_near_text(front: FrontRecord | None) -> str:

@@ -21,7 +21,7 @@ MAX_STEPS_ROWS = 20
 """How many points the table of env steps to solve shows; the CSV file beside the report has them all."""
 COLLAPSED = "collapsed"
 """The heading of the column that says which trials collapsed."""
-_ONE_DECIMAL = {"score", "training_return", "core_seconds", "best_score", "mean_score"}
+_RETURNS = {"score", "training_return", "best_score", "mean_score"}
 
 
 class Cell(NamedTuple):
@@ -166,4 +166,6 @@ def _cell(name: str, value: Any, *, is_empty: bool = False) -> Cell:
         return Cell(text, text, "collapsed" if value else "")
     if name == "seed":  # a name more than a number
         return Cell(value, str(value))
-    return Cell(value, return_text(value) if name in _ONE_DECIMAL else number(value))
+    if name == "core_seconds":
+        return Cell(value, f"{value:.1f}")
+    return Cell(value, return_text(value) if name in _RETURNS else number(value))

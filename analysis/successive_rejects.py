@@ -75,11 +75,14 @@ class Standing:
         Of the first evaluation only the mean is known: the spread is that of the episodes played since.
 
         Returns:
-            Its ends; None if fewer than two episodes were played since, or the spread is not a finite number.
+            Its ends; None if fewer than two episodes were played since, the spread is not a finite number, or these
+            are all equal and those of the first evaluation were not: then nothing is known of how far they spread.
         """
         if len(self.returns) < 2:
             return None
         spread = variance(np.asarray(self.returns, dtype=np.float64))
+        if spread == 0.0 and self.num_first and not math.isclose(self.returns[0], self.first_mean, rel_tol=1e-9):
+            return None
         half = t_quantile(0.975, len(self.returns) - 1.0) * math.sqrt(spread / self.num_episodes)
         return (self.score - half, self.score + half) if math.isfinite(half) else None
 

@@ -17,6 +17,12 @@ NONE = "\u2013"
 """The text for a value that is not known."""
 PLAIN_NONE = "-"
 """The same for a terminal, which may not be able to show the other character."""
+_SMALL = 2.0
+"""Returns below it have more decimals: those of 0 to 1, and what an interval of these may reach."""
+_TINY = 0.01
+"""Returns below it have as many significant digits as others have decimals."""
+_DECIMALS = 3
+_MOST_DECIMALS = 8
 
 
 def number(value: Any) -> str:
@@ -84,7 +90,7 @@ def seed_range(seeds: Sequence[int]) -> str:
 
 def interval_text(estimate: Estimate) -> str:
     """Format an interval as "188.1 to 199.9"."""
-    return f"{return_text(estimate.lower)} to {return_text(estimate.upper)}"
+    return range_text(estimate.lower, estimate.upper)
 
 
 def is_number(value: Any) -> bool:
@@ -128,21 +134,44 @@ def short_text(value: Any) -> str:
     return "x".join(map(short_text, value)) if isinstance(value, list | tuple) else setting_text(value)
 
 
-def return_text(value: float | None, *, none: str = NONE) -> str:
-    """Format a return or a score, with one decimal."""
-    return none if value is None else f"{value:z.1f}"
+def return_text(value: float | None, *beside: float, none: str = NONE) -> str:
+    """Format a return or a score: with one decimal; where returns are small, with more.
+
+    Returns of 0 to 1, as FrozenLake's, are told apart by their second and third decimals.
+
+    Args:
+        value: The return.
+        beside: What it is read beside, and is to have as many decimals as: an interval's other end, the mean of a
+            deviation. The largest of them all decides.
+        none: The text of a return that is not known.
+    """
+    return none if value is None else f"{value:z{_places(value, *beside)}}"
 
 
-def known_return_text(value: float) -> str:
+def range_text(lower: float, upper: float) -> str:
+    """Format the ends of a range of returns as "188.1 to 199.9"."""
+    return f"{return_text(lower, upper)} to {return_text(upper, lower)}"
+
+
+def known_return_text(value: float, *beside: float) -> str:
     """Format a return or a score that may be no finite number, which is said in words."""
     if math.isfinite(value):
-        return return_text(value)
+        return return_text(value, *beside)
     return "not a number" if math.isnan(value) else "infinite"
 
 
-def difference_text(value: float) -> str:
-    """Format a difference of two returns, with its sign and one decimal; what rounds to zero is "+0.0"."""
-    return f"{value:+z.1f}"
+def difference_text(value: float, *beside: float) -> str:
+    """Format a difference of two returns, with its sign and the decimals of `return_text`; nothing is "+0.0"."""
+    return f"{value:+z{_places(value, *beside)}}"
+
+
+def _places(*values: float) -> str:
+    """Return how returns are formatted that are read beside each other."""
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    if largest == 0.0 or largest >= _SMALL:
+        return ".1f"
+    decimals = _DECIMALS if largest >= _TINY else _DECIMALS - 1 - math.floor(math.log10(largest))
+    return f".{decimals}f" if decimals <= _MOST_DECIMALS else f".{_DECIMALS}g"
 
 
 def bytes_text(number: float) -> str:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from analysis.comparison.compare import Comparison
 from analysis.comparison.entries import Entry
 from analysis.comparison.pairs import Pair
 from analysis.records import Objective
 from analysis.statistics import Estimate
-from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
+from analysis.wording import PLAIN_NONE, counted, difference_text, duration, range_text, return_text, setting_text
 
 _SCORES: dict[Objective, str] = {
     "final": "final return",
@@ -56,7 +56,8 @@ def _lines(pair: Pair, objective: Objective) -> list[str]:
         what = f"{left} - {right}, over training seeds" + (" (env steps)" if sign < 0 else "")
         low, high = sorted((sign * pair.difference.lower, sign * pair.difference.upper))
         mean = sign * pair.difference.mean
-        lines.append(f"{what}: {_signed(mean, sign)} ({_signed(low, sign)} to {_signed(high, sign)} with 95 %)")
+        of_mean, of_low, of_high = (_signed(value, sign, (mean, low, high)) for value in (mean, low, high))
+        lines.append(f"{what}: {of_mean} ({of_low} to {of_high} with 95 %)")
     if pair.probability is not None:
         lines.append(f"P({left} > {right}), a training scores more: {_share(pair.probability)}")
     else:
@@ -87,12 +88,13 @@ def _iqm(estimate: Estimate, objective: Objective) -> str:
 
 def _range(lower: float, upper: float, objective: Objective) -> str:
     # Fewer env steps are better, so that they are scored below zero.
-    ends = (upper, lower) if objective == "steps_to_threshold" else (lower, upper)
-    return " to ".join(_score_text(end, objective) for end in ends)
+    if objective == "steps_to_threshold":
+        return f"{_score_text(upper, objective)} to {_score_text(lower, objective)}"
+    return range_text(lower, upper)
 
 
-def _signed(value: float, sign: float) -> str:
-    return f"{value:+z,.0f}" if sign < 0 else f"{value:+z.1f}"
+def _signed(value: float, sign: float, beside: Sequence[float]) -> str:
+    return f"{value:+z,.0f}" if sign < 0 else difference_text(value, *beside)
 
 
 def _point(entry: Entry) -> str:

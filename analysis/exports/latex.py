@@ -10,6 +10,7 @@ from analysis.points import value_text
 from analysis.records import Objective
 from analysis.statistics import Estimate
 from analysis.tables import point_names
+from analysis.wording import return_text
 
 NUM_LISTED = 10
 _MISSING = "--"
@@ -88,7 +89,7 @@ def _row(
     # Fewer env steps are better, so that they are scored below zero.
     ends = [] if interval is None else [interval.lower, interval.upper]
     low_high = sorted(-end for end in ends) if in_steps else ends
-    shown = [_shown(value, in_steps=in_steps) for value in low_high]
+    shown = [_shown(value, *low_high, in_steps=in_steps) for value in low_high]
     cells = [
         *(escaped(value_text(item.point, name)) for name in names),
         str(len(item.scores)),
@@ -98,8 +99,8 @@ def _row(
     return [*cells, f"{num_solved(item, data)} of {len(item.scores)}"] if solving else cells
 
 
-def _shown(value: float, *, in_steps: bool) -> str:
-    return _number_of(f"{max(0.0, value):.0f}" if in_steps else f"{value:z.1f}")
+def _shown(value: float, *beside: float, in_steps: bool) -> str:
+    return _number_of(f"{max(0.0, value):.0f}" if in_steps else return_text(value, *beside))
 
 
 def _number_of(text: str) -> str:

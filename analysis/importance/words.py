@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from analysis.importance.answer import Importance, WhatMattered
 from analysis.records import Objective
-from analysis.wording import NONE, counted, return_text
+from analysis.wording import NONE, counted, range_text, return_text
 
 SCORES: dict[Objective, str] = {
     "final": "return in the later half of training",
@@ -74,5 +74,6 @@ def score_interval(low: float | None, high: float | None, objective: Objective) 
     """Return the interval of a score: "188.1 to 199.9"."""
     if low is None or high is None:
         return NONE
-    ends = (high, low) if objective == "steps_to_threshold" else (low, high)
-    return " to ".join(score_text(end, objective) for end in ends)
+    if objective == "steps_to_threshold":
+        return f"{score_text(high, objective)} to {score_text(low, objective)}"
+    return range_text(low, high)

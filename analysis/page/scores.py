@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from analysis.best_records import SettingRecord, SettingsRecord
-from analysis.wording import number, return_text
+from analysis.wording import number, range_text, return_text
 
 _MEANS = {
     "final": "in the later half of training",
@@ -32,5 +32,6 @@ def interval_of(settings: SettingsRecord, item: SettingRecord) -> str | None:
     """Return the interval of a setting's score over training seeds: "185.4 to 199.0"; None: it has none."""
     if item.lower is None or item.upper is None:
         return None
-    ends = (item.upper, item.lower) if counts_env_steps(settings) else (item.lower, item.upper)
-    return " to ".join(score_text(settings, end) for end in ends)
+    if counts_env_steps(settings):
+        return f"{score_text(settings, item.upper)} to {score_text(settings, item.lower)}"
+    return range_text(item.lower, item.upper)

@@ -67,7 +67,7 @@ def test_the_table_tells_how_far_it_is_what_is_best_and_what_runs(running: tuple
     ]  # fmt: skip
     assert rows(text) == [
         ["1", "t0000", "195.2", "completed", "50,000", "0.001", "-", "-"],
-        ["2", "t0002", "20.0", "running", "12,345", "0.003", "33.0", "-1.5", "2,469"],
+        ["2", "t0002", "20.0", "running", "12,345", "0.003", "33.0", "-1.500", "2,469"],
         ["-", "t0003", "-", "running", "0", "0.004", "-", "-"],
     ]
 

@@ -186,6 +186,15 @@ def test_the_interval_is_students_where_the_first_evaluation_weighs_nothing() ->
     assert more[1] - more[0] == pytest.approx((wider[1] - wider[0]) / math.sqrt(2))
 
 
+def test_later_episodes_that_are_all_equal_say_nothing_where_the_first_ones_were_not() -> None:
+    """As on FrozenLake: two of ten reached the goal, then none of 35. "All equal" was said of their score, 0.044."""
+    assert Standing(0, 0.2, 10, [0.0] * 35).interval() is None
+    mean = sum([-0.1] * 7) / 7
+    assert mean != -0.1
+    assert Standing(0, mean, 7, [-0.1] * 5).interval() == pytest.approx((-0.1, -0.1))
+    assert Standing(0, 0.2, 0, [0.0] * 35).interval() == (0.0, 0.0)
+
+
 def found_best(seed: int) -> tuple[bool, bool]:
     """Whether ten evaluation episodes find the best of sixteen policies of means 0 to 1.5, and whether more do."""
     rng = np.random.default_rng(seed)

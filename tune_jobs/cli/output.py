@@ -165,10 +165,11 @@ def show_best(best: BestRecord, *, as_json: bool) -> None:
 def _print_best(console: Console, best: BestRecord) -> None:
     point = ", ".join(f"{name} {setting_text(value)}" for name, value in best.point.items())
     where = f"{best.checkpoint.trial_id}, iteration {best.checkpoint.iteration}"
+    gap = f"gap {difference_text(best.optimism_gap, best.confirmation.mean_return)}"
     facts = {
         "policy": f"{point or 'no searched values'}  ({where}, {best.checkpoint.num_env_steps:,} env steps)",
         **_chosen(best),
-        "confirmed at": f"{_returns(best.confirmation)}; gap {difference_text(best.optimism_gap)}",
+        "confirmed at": f"{_returns(best.confirmation)}; {gap}",
         "random policy": f"{_returns(best.random)}{_beside_random(best)}",
     }
     print_facts(console, facts | _verdict(best.confirmation) | _setting_facts(best.settings))
@@ -270,7 +271,8 @@ def span(seeds: Sequence[int]) -> str:
 
 def _returns(record: EvaluationRecord) -> str:
     low, high = min(record.returns), max(record.returns)
-    spread = f"{record.mean_return:.1f} ± {record.std_return:.1f}"
+    mean, deviation = record.mean_return, record.std_return
+    spread = f"{return_text(mean, deviation)} ± {return_text(deviation, mean)}"
     return f"{spread} over {counted(record.num_episodes, 'episode')} ({low:g} to {high:g})"
 
 

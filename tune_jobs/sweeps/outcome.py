@@ -10,7 +10,7 @@ from typing import Literal
 from analysis.best_records import BestRecord
 from analysis.notebook import brief_repr, facts_html
 from analysis.records import SweepRecord, SweepState, TrialRecord, TrialStatus
-from analysis.wording import counted
+from analysis.wording import counted, return_text
 from tune_jobs.sweeps.storage import folder_at, shown_place
 
 Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
@@ -62,7 +62,7 @@ class SweepResult:
         return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
 
     def __repr__(self) -> str:
-        best = self.best and f"{self.best.checkpoint.trial_id} scored {self.best.selection_score:.1f}"
+        best = self.best and f"{self.best.checkpoint.trial_id} scored {return_text(self.best.selection_score)}"
         return brief_repr(
             "SweepResult", place=self.place, state=self.state, counts=self.counts, best=best,
             why_no_best=self.why_no_best, artifacts=list(self.artifacts), exit_code=self.exit_code,

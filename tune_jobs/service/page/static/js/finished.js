@@ -1,6 +1,6 @@
 // What a finished sweep has come to: the policy to deploy, the setting to train with, its report and films.
 import { el } from "./dom.js";
-import { count, counted, pointText, returnText } from "./format.js";
+import { count, counted, pointText, rangeText, returnText } from "./format.js";
 import { playLink } from "./play_links.js";
 import { isLive, isWaiting, stateOf } from "./states.js";
 
@@ -112,9 +112,11 @@ function toldAsEarlier(sweep, isFile) {
 function settingAnswer({ objective, num_may_be_best: numAsGood, ranking: [setting] }) {
   // Env steps are written as negative numbers, as fewer are better.
   const inSteps = objective === "steps_to_threshold";
-  const text = (value) => (inSteps ? count(Math.max(0, -value)) : returnText(value));
-  const ends = inSteps ? [setting.upper, setting.lower] : [setting.lower, setting.upper];
-  const range = ends.includes(null) ? "" : ` (95 % interval ${ends.map(text).join(" to ")})`;
+  const steps = (value) => count(Math.max(0, -value));
+  const text = inSteps ? steps : returnText;
+  const { lower, upper } = setting;
+  const ends = inSteps ? `${steps(upper)} to ${steps(lower)}` : rangeText(lower, upper);
+  const range = lower === null || upper === null ? "" : ` (95 % interval ${ends})`;
   // The number of the report and of the command line: the mean over its seeds.
   const score = `${text(setting.score)} ${SCORES[objective] ?? "score"}${range}`;
   const others = numAsGood - 1;

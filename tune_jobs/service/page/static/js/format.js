@@ -2,6 +2,8 @@
 export const NONE = "–";
 const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const tenths = new Intl.NumberFormat("en", { minimumFractionDigits: 1, maximumFractionDigits: 1 });
+const thousandths = new Intl.NumberFormat("en", { minimumFractionDigits: 3, maximumFractionDigits: 3 });
+const tiny = new Intl.NumberFormat("en", { minimumSignificantDigits: 3, maximumSignificantDigits: 3 });
 const short = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 3 });
 const day = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit" });
 const date = new Intl.DateTimeFormat("en-GB", { dateStyle: "long", timeStyle: "medium" });
@@ -9,7 +11,16 @@ const date = new Intl.DateTimeFormat("en-GB", { dateStyle: "long", timeStyle: "m
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 export const count = (value) => (isNumber(value) ? whole.format(value) : NONE);
 export const compact = (value) => (isNumber(value) ? short.format(value) : NONE);
-export const returnText = (value) => (isNumber(value) ? tenths.format(Object.is(value, -0) ? 0 : value) : NONE);
+
+// With one decimal; returns of 0 to 1 are told apart by their second and third. With as many as what it is read beside.
+export function returnText(value, ...beside) {
+  if (!isNumber(value)) return NONE;
+  const size = Math.max(...[value, ...beside].filter(isNumber).map(Math.abs));
+  const form = size === 0 || size >= 2 ? tenths : size >= 0.01 ? thousandths : tiny;
+  return form.format(value === 0 ? 0 : value);
+}
+
+export const rangeText = (low, high) => `${returnText(low, high)} to ${returnText(high, low)}`;
 export const counted = (number, noun, plural = `${noun}s`) => `${count(number)} ${number === 1 ? noun : plural}`;
 
 export function significant(value, digits = 4) {

@@ -2,7 +2,7 @@
 import { el, setAttribute, setText } from "./dom.js";
 import { Ended } from "./ended.js";
 import { FrontChart } from "./front_chart.js";
-import { count, NONE, returnText, valueText } from "./format.js";
+import { count, NONE, rangeText, returnText, valueText } from "./format.js";
 
 const TOO_FEW = "Said once trials of two settings have ended.";
 const DRAWN = "Each dot is a setting, by its expected mean over seeds; none lies above the line.";
@@ -125,4 +125,4 @@ export class FrontCard {
 }
 
 const interval = ({ lower, upper }) =>
-  lower === null || upper === null ? NONE : `${returnText(lower)} to ${returnText(upper)}`;
+  lower === null || upper === null ? NONE : rangeText(lower, upper);
