@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 
-from tests.benchmarks.search import envs
+from tests.benchmarks.search import confirmed_runs, envs
 from tests.benchmarks.search import trainings as module
 from tests.benchmarks.search.__main__ import DATA
+from tests.benchmarks.search.all_runs import run_all
 from tests.benchmarks.search.pack_trainer import ENVS
-from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run, run_all
+from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run
 from tests.benchmarks.search.same_task import AnotherTaskError, check_same_task
 from tests.benchmarks.search.tables import tables
 from tests.benchmarks.search.tasks import TASKS, TEST_SEEDS, TUNING_SEEDS, Task
@@ -249,3 +250,64 @@ def test_the_time_limit_of_mountain_car_is_an_end() -> None:
         == f"{envs.__name__}:EndingMountainCar-v0"
         == f"{ENVS}:EndingMountainCar-v0"
     )
+
+
+def confirmed(method: str, number: int, formula: Formula) -> tuple[Run, list[list[Wanted]]]:
+    """The same as `played`, of a run as a sweep makes it."""
+    generator, asked = confirmed_runs.run(TASK, method, number), []
+    wanted = next(generator)
+    while True:
+        asked.append(wanted)
+        try:
+            wanted = generator.send([formula(item.point, item.seed) for item in wanted])
+        except StopIteration as end:
+            return end.value, asked
+
+
+def first_seed_flatters(point: Mapping[str, Any], seed: int) -> float | None:
+    """What is far from the best has luck with its first seed, and fails with its second."""
+    score = -abs(math.log10(point["lr"]) + 3)
+    if score < -1.5:
+        return 5.0 if seed == 0 else None
+    return score + 0.01 * ((seed * 7) % 3)
+
+
+@pytest.mark.parametrize("method", list(confirmed_runs.CONFIRMED))
+def test_a_run_with_confirm_makes_as_many_trainings_and_names_no_lucky_setting(method: str) -> None:
+    found, asked = confirmed(method, 1, first_seed_flatters)
+    searched = [item for wanted in asked for item in wanted if item.seed == 0]
+    raced = [item for wanted in asked[:-1] for item in wanted if item.seed != 0]
+    assert len(searched) == len(found.scores) == 82
+    assert 0 < len(raced) <= 14
+    assert {item.seed for item in raced} <= set(range(1, 6))
+    # No training twice, and none of those that judge.
+    assert len({item.key for wanted in asked for item in wanted}) == sum(map(len, asked))
+    assert [item.seed for item in asked[-1]] == list(TEST_SEEDS)
+    # The five leading ones are all of those that had luck; what is named is none that failed after it.
+    assert max(found.scores[:82]) == 5.0
+    assert {json.dumps(item.point) for item in asked[-1]} == {json.dumps(found.best)}
+    best = next(index for index, item in enumerate(searched) if item.point == found.best)
+    assert found.scores[best] != -math.inf
+
+
+def test_settings_with_more_seeds_are_ranked_by_what_is_expected_of_them() -> None:
+    returns: list[list[float | None]] = [[4.0, 1.0, 1.0], [3.0, 3.1, 2.9], [2.0], [None], [2.0]]
+    assert confirmed_runs.ranked(returns)[0] == 1
+    assert confirmed_runs.finite_scores(returns)[3] == (1.0,)
+    assert confirmed_runs.ranked([[None], [1.0], [1.0]]) == [1, 2, 0]
+
+
+def test_tables_have_runs_with_confirm_on_test_seeds_alone() -> None:
+    def kept(score: float, test: float) -> dict[str, Any]:
+        return {"date": "2026-01-01", "machine": "one", "runs": [{"scores": [score], "test": test}] * 5}
+
+    found = {("cartpole-ppo", "random"): kept(500.0, 400.0), ("cartpole-ppo", "gp"): kept(500.0, 410.0)}
+    without = list(tables(found))
+    lines = list(tables({**found, ("cartpole-ppo", "gp-confirm"): kept(480.0, 470.0)}))
+    first, second = (index for index, line in enumerate(lines) if line.startswith("| task |"))
+    assert "gp-confirm" not in lines[first]
+    assert lines[second] == "| task | random | gp | gp-confirm |"
+    assert lines[second + 2] == "| cartpole-ppo | 400.0 ± 0.0 | 410.0 ± 0.0 | 470.0 ± 0.0 |"
+    assert [line for line in lines if line.startswith("Mean rank") and line not in without] == [
+        "Mean rank of 3 over 1 task, on test seeds: random 3.00, gp 2.00, gp-confirm 1.00."
+    ]

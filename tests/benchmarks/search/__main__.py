@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.ppo import machine_name
-from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, finite, run_all
+from tests.benchmarks.search.all_runs import run_all
+from tests.benchmarks.search.confirmed_runs import CONFIRMED
+from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, finite
 from tests.benchmarks.search.same_task import AnotherTaskError, check_same_task
 from tests.benchmarks.search.schedulers import SCHEDULERS
 from tests.benchmarks.search.tables import tables
@@ -69,7 +71,7 @@ def main() -> None:
     """Train what is missing, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; none: all")
-    methods = (*METHODS, *SCHEDULERS)
+    methods = (*METHODS, *CONFIRMED, *SCHEDULERS)
     parser.add_argument("--methods", nargs="+", choices=methods, default=methods, help="these alone")
     parser.add_argument("--runs", type=int, default=NUM_RUNS, help="of each method")
     parser.add_argument("--processes", type=int, default=2, help="how many packs train at once")
@@ -84,7 +86,7 @@ def main() -> None:
         except AnotherTaskError as error:
             raise SystemExit(f"error: {error}") from None
         if not options.tables:
-            choosing = [method for method in options.methods if method in METHODS]
+            choosing = [method for method in options.methods if method in (*METHODS, *CONFIRMED)]
             with closing(Trainings(TASKS[name], DATA / f"{name}.jsonl", options.processes)) as trainings:
                 keep(name, run_all(TASKS[name], trainings, choosing, options.runs))
             whole = WholeRuns(TASKS[name], DATA / f"{name}.whole.jsonl", options.processes)

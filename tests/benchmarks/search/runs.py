@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tests.benchmarks.search.tasks import TEST_SEEDS, TUNING_SEEDS, Task
-from tests.benchmarks.search.trainings import Trainings, Wanted
+from tests.benchmarks.search.trainings import Wanted
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.proposal import next_point
@@ -84,23 +84,3 @@ def run(task: Task, method: str, number: int) -> Generator[list[Wanted], list[fl
     best = known[means.index(max(means))].point
     test = yield [Wanted(best, seed) for seed in TEST_SEEDS]
     return Run(means, best, mean_or_worst(test))
-
-
-def run_all(
-    task: Task, trainings: Trainings, methods: Sequence[str], num_runs: int = NUM_RUNS
-) -> dict[tuple[str, int], Run]:
-    """Run every method as often as is asked, all side by side, and return what each run found."""
-    running = {(method, number): run(task, method, number) for method in methods for number in range(num_runs)}
-    wanted = {name: next(generator) for name, generator in running.items()}
-    done: dict[tuple[str, int], Run] = {}
-    while wanted:
-        made = trainings.returns([item for items in wanted.values() for item in items])
-        answers = {name: [next(made) for _ in items] for name, items in wanted.items()}
-        wanted = {}
-        for name, returns in answers.items():
-            try:
-                wanted[name] = running[name].send(returns)
-            except StopIteration as end:
-                done[name] = end.value
-        print(f"{task.name}: {len(trainings)} trainings, {len(done)} of {len(running)} runs ended", flush=True)
-    return done

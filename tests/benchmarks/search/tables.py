@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from analysis.wording import counted
+from tests.benchmarks.search.confirmed_runs import CONFIRMED
 from tests.benchmarks.search.runs import METHODS, NUM_RUNS
 from tests.benchmarks.search.tasks import TASKS
 from tune_jobs.spec.sections import AUTO_SEARCH
@@ -20,7 +21,10 @@ Kept = Mapping[tuple[str, str], dict[str, Any] | None]
 
 def tables(kept: Kept) -> Iterator[str]:
     """Yield the lines of the page's tables; a cell without runs is empty."""
-    methods = list(dict.fromkeys(method for (_, method), found in kept.items() if found is not None))
+    everything = list(dict.fromkeys(method for (_, method), found in kept.items() if found is not None))
+    # What these name is not the highest of many scores while tuning, so that they have none that could be compared.
+    confirmed = [method for method in everything if method in CONFIRMED]
+    methods = [method for method in everything if method not in CONFIRMED]
     tasks = [task for task in TASKS if any(kept.get((task, method)) for method in methods)]
     yield "The best point of a run by its score while tuning, as ARLBench publishes it, mean of the runs:"
     yield ""
@@ -28,7 +32,7 @@ def tables(kept: Kept) -> Iterator[str]:
     yield ""
     yield "The same points trained again on five seeds on which nothing was chosen:"
     yield ""
-    yield from _table(kept, tasks, methods, "test", published=False)
+    yield from _table(kept, tasks, [*methods, *confirmed], "test", published=False)
     yield ""
     # The more methods, the fewer tasks that all of them have run.
     everywhere = [method for method in methods if all(kept.get((task, method)) for task in tasks)]
@@ -36,8 +40,10 @@ def tables(kept: Kept) -> Iterator[str]:
     default = [method for method in methods if method in ("random", AUTO_SEARCH)]
     for some in dict.fromkeys(map(tuple, (default, everywhere, choosing, methods))):
         yield from _ranks(kept, tasks, some)
+    for named in dict.fromkeys(((*default, *confirmed), (*methods, *confirmed)) if confirmed else ()):
+        yield from _ranks(kept, tasks, named, {"test": "on test seeds"})
     yield ""
-    yield from _made(kept, tasks, methods)
+    yield from _made(kept, tasks, everything)
 
 
 def values_of(found: dict[str, Any], what: str) -> list[float]:
@@ -68,13 +74,16 @@ def _cell(found: dict[str, Any], what: str) -> str:
     return f"{values.mean():.1f} ± {half:.1f}{of}"
 
 
-def _ranks(kept: Kept, tasks: list[str], methods: Sequence[str]) -> Iterator[str]:
+_BOTH = {"score": "while tuning", "test": "on test seeds"}
+
+
+def _ranks(kept: Kept, tasks: list[str], methods: Sequence[str], by: Mapping[str, str] = _BOTH) -> Iterator[str]:
     """Yield mean ranks over the tasks that all methods have run, each run compared with those of its number."""
     whole = [task for task in tasks if all(kept.get((task, method)) for method in methods)]
     if not whole or len(methods) < 2:
         return
     told = []
-    for what, words in (("score", "while tuning"), ("test", "on test seeds")):
+    for what, words in by.items():
         ranks = []
         for task in whole:
             rows = [values_of(found, what) for method in methods if (found := kept[task, method])]
