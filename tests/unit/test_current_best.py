@@ -97,7 +97,7 @@ def test_a_policy_is_chosen_anew_before_it_plays_or_is_trained_on(
 def test_attach_names_no_outdated_winner(extended: SweepStore, monkeypatch: pytest.MonkeyPatch) -> None:
     result = attach(extended.folder, progress="none")
     assert (result.best, result.artifacts, result.exit_code) == (None, {}, 0)
-    why = "the one there is was chosen before the sweep was trained on. `tune-jobs best mine` does it"
+    why = f"the one there is was chosen before the sweep was trained on. `tune-jobs best {extended.folder}` does it"
     assert present(result.why_no_best).startswith(why)
 
     def broken(*_: object) -> None:

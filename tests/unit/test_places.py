@@ -13,8 +13,8 @@ from policies.errors import SpecError
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.output import show_result, show_status
 from tune_jobs.service.config import ServiceConfig
-from tune_jobs.store.opening import is_url, name_for_commands, open_storage, open_sweep, sweep_of_trial
-from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.command_names import name_in_commands
+from tune_jobs.store.opening import is_url, open_storage, open_sweep, sweep_of_trial
 from tune_jobs.store.urls import join_place, name_of_place, outer_place
 from tune_jobs.sweeps.create import CreatedSweep
 from tune_jobs.sweeps.outcome import SweepResult
@@ -192,8 +192,26 @@ def test_a_folder_is_opened_by_its_url_or_its_path(tmp_path: Path) -> None:
     for place in (tmp_path, str(tmp_path), tmp_path.as_uri()):
         assert open_storage(place).place == str(tmp_path)
         assert open_sweep(place).place == str(tmp_path)
-    assert name_for_commands(SweepStore(tmp_path / "mine")) == "mine"
     assert sweep_of_trial(str(tmp_path / "mine" / "trials" / "t0000")) is None
+
+
+def test_commands_that_are_told_find_the_sweep_from_where_they_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("TUNE_JOBS_STORAGE", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert name_in_commands(str(tmp_path / "sweeps" / "mine")) == "mine"
+    assert name_in_commands(str(tmp_path / "other" / "mine")) == str(tmp_path / "other" / "mine")
+    assert (
+        name_in_commands(str(tmp_path.parent / "my sweeps" / "mine")) == f"'{tmp_path.parent / 'my sweeps' / 'mine'}'"
+    )
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "other")
+    assert name_in_commands(str(tmp_path / "other" / "mine")) == "mine"
+    assert name_in_commands(str(tmp_path / "sweeps" / "mine")) == str(tmp_path / "sweeps" / "mine")
+    url = "s3://bucket/sweeps/mine?endpoint=http://localhost:9000"
+    assert name_in_commands(url) == f"'{url}'"
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "s3://bucket/sweeps")
+    assert name_in_commands(str(tmp_path / "sweeps" / "mine")) == str(tmp_path / "sweeps" / "mine")
 
 
 def test_a_result_has_the_folder_of_a_sweep_that_has_one() -> None:

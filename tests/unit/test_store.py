@@ -354,7 +354,7 @@ def test_one_process_at_a_time_drives_a_sweep_and_a_killed_one_no_longer_does(st
         assert store.is_driven()
         with pytest.raises(CannotRunError, match="another process") as raised, store.lock():
             pass
-        assert "tune-jobs status mine" in raised.value.hint
+        assert f"tune-jobs status {store.folder}" in raised.value.hint
         os.kill(process.pid, 9)
         process.wait()
     assert not store.is_driven()

@@ -29,6 +29,7 @@ from analysis.records import (
     CheckpointRecord,
 )
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.results_tail import ResultsMark
 
@@ -58,7 +59,7 @@ def test_a_name_is_given_once(harness: Harness, sweep: Sweep, another: Reopen) -
     sweep.write_record(make_sweep())
     with pytest.raises(SpecError) as raised:
         another().create()
-    assert "tune-jobs resume mine" in raised.value.hint
+    assert f"tune-jobs resume {name_in_commands(sweep.place)}" in raised.value.hint
     another().discard()
     assert harness.storage().new_sweep("mine").name == "mine"
     another().create()

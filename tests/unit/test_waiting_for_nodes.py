@@ -154,7 +154,7 @@ def test_the_limit_ends_the_wait_and_the_sweep_is_kept(monkeypatch: pytest.Monke
     error: Any = caught.value
     assert error.message.startswith("No node that one trial fits on joined within 0.1 s. One trial needs 3 CPUs")
     assert "forever" not in error.message
-    assert "`tune-jobs resume mine --address auto --wait-for-nodes SECONDS`" in error.hint
+    assert f"`tune-jobs resume {store.place} --address auto --wait-for-nodes SECONDS`" in error.hint
     status = status_of(store, store.read_record(), store.read_trials())
     assert status.state == "created"
     assert ", in vain. One trial needs 3 CPUs" in status.facts()["waited for"]

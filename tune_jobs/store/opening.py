@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import shlex
 from pathlib import Path
 
 from analysis.records import SweepRecord
-from policies.errors import CannotRunError
-from policies.files import absolute
 from tune_jobs.store import probe
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.store.local_storage import LocalStorage
 from tune_jobs.store.names import TRIALS_FOLDER
@@ -20,15 +17,12 @@ from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
 __all__ = [
     "is_url",
-    "name_for_commands",
     "open_storage",
     "open_sweep",
     "others_write",
     "resume_command",
     "sweep_of_trial",
 ]
-
-DEFAULT_STORAGE = "sweeps"
 
 
 def open_storage(place: str | Path) -> Storage:
@@ -67,11 +61,6 @@ def others_write(place: str | Path) -> None:
             known.let_others_write()
 
 
-def name_for_commands(sweep: Sweep) -> str:
-    """Return how a command names a sweep: by its name in a storage folder, by its URL in an object store."""
-    return sweep.place if is_url(sweep.place) else sweep.name
-
-
 def resume_command(sweep: Sweep, record: SweepRecord | None) -> str:
     """Return the command that goes on with a sweep where it ran last; a name means one in the default storage.
 
@@ -84,16 +73,7 @@ def resume_command(sweep: Sweep, record: SweepRecord | None) -> str:
         at = f" --address {shlex.quote(record.job.address)} --detach"
     elif record is not None and record.address is not None:
         at = f" --address {shlex.quote(record.address)}"
-    named = name_for_commands(sweep) if is_url(sweep.place) or _is_in_default_storage(sweep) else sweep.place
-    return f"tune-jobs resume {shlex.quote(named)}{at}"
-
-
-def _is_in_default_storage(sweep: Sweep) -> bool:
-    storage = os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
-    # Where the working directory is gone, no relative folder is the sweep's.
-    with contextlib.suppress(CannotRunError):
-        return not is_url(storage) and absolute(folder_of(storage).expanduser()) == folder_of(sweep.place).parent
-    return False
+    return f"tune-jobs resume {name_in_commands(sweep.place)}{at}"
 
 
 def answer(place: str, machine: str) -> str:

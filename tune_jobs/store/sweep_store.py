@@ -19,6 +19,7 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError, Spec
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.leftovers import remove_abandoned
 from tune_jobs.store.locks import held, is_held
 from tune_jobs.store.ownership import Owner
@@ -226,7 +227,8 @@ class SweepStore:
         path = within(self.best_folder, names.BEST_RECORD)
         if not path.is_file():
             raise NotFoundError(
-                f"Sweep {self.name} has no best policy yet.", f"Choose it with `tune-jobs best {self.name}`."
+                f"Sweep {self.name} has no best policy yet.",
+                f"Choose it with `tune-jobs best {name_in_commands(self.place)}`.",
             )
         return read_record(path, BestRecord, "best record", is_sealed=True)
 
@@ -356,7 +358,8 @@ class SweepStore:
         Raises:
             CannotRunError: Another process holds it, or runs the sweep on a cluster.
         """
-        watch = f"Watch it with `tune-jobs status {self.name}`, or end it with `tune-jobs stop {self.name}`."
+        named = name_in_commands(self.place)
+        watch = f"Watch it with `tune-jobs status {named}`, or end it with `tune-jobs stop {named}`."
         with held(self._lock_path, f"Sweep {self.name} is being run by another process.", watch):
             if is_held(self._driver_lock_path):
                 raise CannotRunError(*self._still_driven)
@@ -382,7 +385,7 @@ class SweepStore:
 
 def name_taken(folder: Path) -> SpecError:
     """Return the error for a new sweep whose folder exists already."""
-    go_on = f"continue it: `tune-jobs resume {folder.name}`"
+    go_on = f"continue it: `tune-jobs resume {name_in_commands(folder)}`"
     unfinished = f"unless it is being written just now, remove that folder: it has no {names.SWEEP_RECORD}"
     other = go_on if SweepStore(folder).exists() else unfinished
     hint = f"Choose another name with --name, or {other}."

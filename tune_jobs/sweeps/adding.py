@@ -44,20 +44,20 @@ def add_what_is_missing(
 
 
 def with_chosen_point(
-    record: SweepRecord, spec: SweepSpec, trials: Sequence[TrialRecord], given: Mapping[str, Any]
+    record: SweepRecord, spec: SweepSpec, trials: Sequence[TrialRecord], given: Mapping[str, Any], named: str
 ) -> SweepRecord:
-    """Return the record of a sweep with one more point, which somebody chose.
+    """Return the record of a sweep with one more point, which somebody chose; the arguments are those of `new_point`.
 
     Raises:
         SpecError: The sweep takes no points, this one is wrong, or the sweep has it already.
     """
     num_points = num_points_of(spec, record.chosen_points)
-    added = ChosenPointRecord(num_points=num_points, point=new_point(record, spec, trials, given))
+    added = ChosenPointRecord(num_points=num_points, point=new_point(record, spec, trials, given, named))
     return record.model_copy(update={"chosen_points": (*record.chosen_points, added)})
 
 
 def new_point(
-    record: SweepRecord, spec: SweepSpec, trials: Sequence[TrialRecord], given: Mapping[str, Any]
+    record: SweepRecord, spec: SweepSpec, trials: Sequence[TrialRecord], given: Mapping[str, Any], named: str
 ) -> dict[str, Any]:
     """Return a point that somebody chose, checked, and as the sweep's own points are written.
 
@@ -66,6 +66,7 @@ def new_point(
         spec: The sweep.
         trials: Its trials.
         given: Values by the names of searched hyperparameters.
+        named: How a command names the sweep.
 
     Raises:
         SpecError: The sweep takes no points, this one is wrong, or a trial has it already.
@@ -75,12 +76,12 @@ def new_point(
     if (known := trial_of_point(spec, point, trials)) is not None:
         raise SpecError(
             f"Sweep {record.name} has this point already: trial {known.trial_id} has its values.",
-            f"Choose other values; `tune-jobs replicate {record.name}` trains the leading points with more seeds.",
+            f"Choose other values; `tune-jobs replicate {named}` trains the leading points with more seeds.",
         )
     if any(item.point == point for item in record.chosen_points):
         raise SpecError(
             f"Sweep {record.name} has this point already; it was not trained yet.",
-            f"Run what is missing with `tune-jobs resume {record.name}`.",
+            f"Run what is missing with `tune-jobs resume {named}`.",
         )
     return point
 

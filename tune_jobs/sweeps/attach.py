@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import tempfile
 import time
 from collections.abc import Iterable, Mapping
@@ -14,8 +13,9 @@ from policies.errors import CannotRunError, CheckpointError
 from tune_jobs.ray_tune.jobs import Job
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import readable_trials
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands, resume_command
+from tune_jobs.store.opening import resume_command
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
@@ -190,7 +190,7 @@ def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
     if page is not None:
         artifacts["report"] = page
     failed = is_whole and job is not None and job.driver_exit_code == 3
-    named = shlex.quote(name_for_commands(store))
+    named = name_in_commands(store.place)
     what = "the one there is was chosen before the sweep was trained on" if store.has_best() else "none was chosen"
     why = f"{what}. `tune-jobs best {named}` does it, or says why not"
     return SweepResult(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +26,9 @@ from tune_jobs.spec.engines import Engine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.seeds import confirmation_seeds
 from tune_jobs.store.candidates import leave_out, read_results, read_trials
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
-from tune_jobs.store.opening import name_for_commands
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.drawing import ReportMatter, videos_of
 from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
@@ -237,14 +236,14 @@ def best_checkpoint(store: Sweep, trial_id: str) -> CheckpointRecord:
     if trial_id not in trials:
         raise NotFoundError(
             f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)} trials.",
-            f"List them with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
+            f"List them with `tune-jobs trials {name_in_commands(store.place)}`.",
         )
     # A trial that failed later may still be evaluated, though it cannot win.
     found = best_of(trials[trial_id].checkpoints)
     if found is None:
         raise NotFoundError(
             f"Trial {trial_id} of sweep {store.name} has no checkpoint with a score.",
-            f"See why with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
+            f"See why with `tune-jobs trials {name_in_commands(store.place)}`.",
         )
     return found
 

@@ -16,8 +16,9 @@ from policies.errors import CannotRunError, NotFoundError, SpecError, TuneJobsEr
 from policies.guard.guard import guarding
 from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.ray_tune.jobs import Job, JobsApi, JobState, check_jobs_address
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands, open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.create import remove_unless_it_waited, removed_if_not_begun, write_created
 from tune_jobs.sweeps.own_job import environment_of, version_here
 from tune_jobs.sweeps.storage import stem_of, storage_place
@@ -116,7 +117,7 @@ def go_on_detached(
     address = check_jobs_address(address)
     store = find_sweep(sweep, storage)
     record = store.read_record()
-    named = shlex.quote(name_for_commands(store))
+    named = name_in_commands(store.place)
     watch = f"Watch it with `tune-jobs attach {named}`, or end it with `tune-jobs stop {named}`."
     if store.is_driven():
         raise CannotRunError(f"Sweep {store.name} is being run by another process.", watch)
@@ -184,9 +185,7 @@ def told_of(job: Job | None) -> str:
 def failure_of(store: Sweep, job: JobRecord, found: Job) -> TuneJobsError:
     """Return the error that a job ended with: its own words, where it has said some."""
     said, hint = _said(found.message or "")
-    again = (
-        f"Continue with `tune-jobs resume {shlex.quote(name_for_commands(store))} --address {job.address} --detach`."
-    )
+    again = f"Continue with `tune-jobs resume {name_in_commands(store.place)} --address {job.address} --detach`."
     kind = {2: SpecError, 4: NotFoundError}.get(found.driver_exit_code or 0, CannotRunError)
     if found.driver_exit_code == NotFoundError.exit_code:
         kind, hint = CannotRunError, "The storage folder has to be the same on this machine and on the cluster's nodes."

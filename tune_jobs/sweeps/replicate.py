@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 
 from analysis.racing import Race
 from analysis.records import FINISHED, ReplicationRecord, SweepRecord
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.plan.sweep_plan import MAX_TRIALS
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands
 from tune_jobs.sweeps.confirm import different_points
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.races import NamedRace, last_race, race_named, ranking_of, round_of
@@ -75,7 +74,7 @@ def _check(store: Sweep, contenders: Sequence[int]) -> None:
     if not contenders:
         raise NotFoundError(
             f"No setting of sweep {store.name} can be replicated: none of its trials was evaluated.",
-            f"See why with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
+            f"See why with `tune-jobs trials {name_in_commands(store.place)}`.",
         )
     if len(contenders) == 1:
         raise SpecError(

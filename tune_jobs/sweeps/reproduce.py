@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shlex
 import shutil
 import tempfile
 import time
@@ -31,9 +30,10 @@ from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.logs import continued_from
-from tune_jobs.store.opening import name_for_commands, open_sweep
+from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.drive import git_commit, machine_here, settled
@@ -114,7 +114,7 @@ def _check(store: Sweep, trial: TrialRecord, spec: SweepSpec, recorded: Sequence
         why = f": it failed before ({error_summary(trial.error)})" if trial.status == "failed" else ""
         raise NotFoundError(
             f"{name} has done no iteration that could be repeated{why}.",
-            f"See `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
+            f"See `tune-jobs trials {name_in_commands(store.place)}`.",
         )
 
 

@@ -13,6 +13,7 @@ from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
 from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled
@@ -65,7 +66,7 @@ def go_on(
             check_extendable(spec, num_samples)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
         if point is not None:
-            record = with_chosen_point(record, spec, store.read_trials(), point)
+            record = with_chosen_point(record, spec, store.read_trials(), point, name_in_commands(store.place))
         plan = add_what_is_missing(store, record, spec, where, address, retry_failed=retry_failed).with_notes(notes)
         return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
 

@@ -10,8 +10,9 @@ from analysis.records import TrialRecord
 from policies.errors import NotFoundError
 from policies.suggestions import did_you_mean
 from tune_jobs.store.candidates import read_trials
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import is_url, name_for_commands, open_storage, open_sweep, sweep_of_trial
+from tune_jobs.store.opening import is_url, open_storage, open_sweep, sweep_of_trial
 from tune_jobs.store.urls import join_place, name_of_place, outer_place
 from tune_jobs.sweeps.storage import place_named, split_trial, storage_place
 
@@ -80,6 +81,6 @@ def find_trial(store: Sweep, trial_id: str) -> TrialRecord:
         raise NotFoundError(
             f"Sweep {store.name} has no trial {trial_id!r}; it has {len(trials)} trials."
             f"{did_you_mean(trial_id, list(trials))}",
-            f"List them with `tune-jobs trials {shlex.quote(name_for_commands(store))}`.",
+            f"List them with `tune-jobs trials {name_in_commands(store.place)}`.",
         )
     return trials[trial_id]

@@ -11,8 +11,9 @@ from urllib.parse import parse_qsl, quote, urlencode
 from policies.errors import SpecError
 from policies.files import absolute
 from tune_jobs.spec.sweep_spec import check_sweep_name
+from tune_jobs.store.command_names import DEFAULT_STORAGE
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import DEFAULT_STORAGE, is_url, open_storage
+from tune_jobs.store.opening import is_url, open_storage
 from tune_jobs.store.urls import URL_SCHEMES, folder_of, name_of_place, outer_place
 
 _KNOWN = ", ".join(f"{scheme}://" for scheme in URL_SCHEMES)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -14,8 +13,8 @@ from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import name_for_commands
 
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection
@@ -139,7 +138,7 @@ def _refuse_what_never_comes(spec: SweepSpec, machine: Machine) -> None:
 def _in_vain(store: Sweep, address: str | None, wait_s: float, told: str) -> CannotRunError:
     job = store.read_record().job
     where = f"{job.address} --detach" if job is not None else str(address)
-    again = f"tune-jobs resume {shlex.quote(name_for_commands(store))} --address {where} --wait-for-nodes SECONDS"
+    again = f"tune-jobs resume {name_in_commands(store.place)} --address {where} --wait-for-nodes SECONDS"
     return CannotRunError(
         f"No node that one trial fits on joined within {wait_s:g} s. {told}",
         f"Add nodes (`ray status` says what an autoscaler does), or wait longer: `{again}`.",

@@ -80,7 +80,7 @@ def inject(name: str, chosen: Inject, service: TheService, caller: AChanger, wai
     record, trials = seen.status.sweep, seen.trials.records
     spec = stored_spec(record)
     # As the sweep writes it, so that a request that says the same in other words is known to be the same.
-    point = new_point(record, spec, trials, chosen.point)
+    point = new_point(record, spec, trials, chosen.point, name)
     added = Addition(points=[point])
     with service.adding:
         _check_growth(service, name, added)

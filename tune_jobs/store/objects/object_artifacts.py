@@ -19,6 +19,7 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.files import atomic_path, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
+from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Listed, Tag
 from tune_jobs.store.objects.parts import Parts
@@ -93,7 +94,7 @@ class Artifacts:
         except NotFoundError as error:
             raise NotFoundError(
                 f"Sweep {self._bucket.url.name} has no best policy yet.",
-                f"Choose it with `tune-jobs best {self._bucket.url.name}`.",
+                f"Choose it with `tune-jobs best {name_in_commands(str(self._bucket.url))}`.",
             ) from error
 
     def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
