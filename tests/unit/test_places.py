@@ -210,7 +210,8 @@ def test_commands_that_are_told_find_the_sweep_from_where_they_are_told(
     assert name_in_commands(str(tmp_path / "sweeps" / "mine")) == str(tmp_path / "sweeps" / "mine")
     url = "s3://bucket/sweeps/mine?endpoint=http://localhost:9000"
     assert name_in_commands(url) == f"'{url}'"
-    monkeypatch.setenv("TUNE_JOBS_STORAGE", "s3://bucket/sweeps")
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "s3://bucket/sweeps?endpoint=http://localhost:9000")
+    assert name_in_commands(url) == "mine"
     assert name_in_commands(str(tmp_path / "sweeps" / "mine")) == str(tmp_path / "sweeps" / "mine")
 
 

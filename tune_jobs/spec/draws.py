@@ -21,7 +21,7 @@ from tune_jobs.spec.domains import Domain, Grid
 MOST_COMBINATIONS = 1_000_000
 """Of grids with conditions, more than these are not counted; no sweep can have as many."""
 _MOST_DRAWS = 200
-"""So many draws of nothing but what is known, and there are hardly any others."""
+"""So many draws of nothing but what is known, and there are hardly any others; of few known points, fewer."""
 
 
 def num_points(space: Mapping[str, Domain], num_samples: int, *, most: int = MOST_COMBINATIONS) -> int:
@@ -113,7 +113,7 @@ def _unseen(
     first = point = _drawn(space, conditions, rng, combination)
     if combination is not None and not any(space[name].is_random for name in first):
         return first
-    for _ in range(_MOST_DRAWS):
+    for _ in range(min(_MOST_DRAWS, 20 + 8 * len(seen))):
         if (key := repr(point)) not in seen:
             seen.add(key)
             return point

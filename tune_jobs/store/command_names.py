@@ -10,7 +10,7 @@ from pathlib import Path
 
 from policies.errors import CannotRunError
 from policies.files import absolute
-from tune_jobs.store.urls import folder_of, is_url
+from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
 DEFAULT_STORAGE = "sweeps"
 _VARIABLE = "TUNE_JOBS_STORAGE"
@@ -25,14 +25,10 @@ def name_in_commands(place: str | Path) -> str:
     Args:
         place: The sweep's place, an absolute folder or a URL.
     """
-    named = (
-        str(place)
-        if is_url(place)
-        else folder_of(place).name
-        if _is_in_default(place)
-        else str(absolute(folder_of(place)))
-    )
-    return shlex.quote(named)
+    place = str(place)
+    if _is_in_default(place):
+        return shlex.quote(name_of_place(place))
+    return shlex.quote(place if is_url(place) else str(folder_of(place)))
 
 
 @contextlib.contextmanager
@@ -51,9 +47,11 @@ def default_storage(place: str) -> Iterator[None]:
             os.environ[_VARIABLE] = before
 
 
-def _is_in_default(place: str | Path) -> bool:
+def _is_in_default(place: str) -> bool:
     storage = os.environ.get(_VARIABLE) or DEFAULT_STORAGE
+    if is_url(place) or is_url(storage):
+        return is_url(place) and outer_place(place) == storage
     # Where the working directory is gone, no relative folder is the sweep's.
     with contextlib.suppress(CannotRunError):
-        return not is_url(storage) and absolute(folder_of(storage).expanduser()) == folder_of(place).parent
+        return absolute(folder_of(storage).expanduser()) == folder_of(place).parent
     return False
