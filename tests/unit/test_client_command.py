@@ -74,7 +74,7 @@ def test_what_is_printed_is_what_is_printed_there(
         monkeypatch.setattr("tune_jobs.sweeps.verbs.best", lambda *_, **__: best)
     monkeypatch.setenv("TUNE_JOBS_STORAGE", str(site.storage))
     here = run(*words)
-    # The service is in this process: its storage stays the default.
+    monkeypatch.delenv("TUNE_JOBS_STORAGE")
     monkeypatch.setenv("TUNE_JOBS_SERVER", site.url)
     there = run(*words)
     assert there.exit_code == here.exit_code

@@ -13,7 +13,7 @@ from policies.errors import SpecError
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.output import show_result, show_status
 from tune_jobs.service.config import ServiceConfig
-from tune_jobs.store.command_names import name_in_commands
+from tune_jobs.store.command_names import name_in_commands, served
 from tune_jobs.store.opening import is_url, open_storage, open_sweep, sweep_of_trial
 from tune_jobs.store.urls import join_place, name_of_place, outer_place
 from tune_jobs.sweeps.create import CreatedSweep
@@ -213,6 +213,14 @@ def test_commands_that_are_told_find_the_sweep_from_where_they_are_told(
     monkeypatch.setenv("TUNE_JOBS_STORAGE", "s3://bucket/sweeps?endpoint=http://localhost:9000")
     assert name_in_commands(url) == "mine"
     assert name_in_commands(str(tmp_path / "sweeps" / "mine")) == str(tmp_path / "sweeps" / "mine")
+
+
+def test_a_service_names_the_sweeps_of_its_storage_by_their_names(tmp_path: Path) -> None:
+    place = str(tmp_path / "mine")
+    with served(str(tmp_path)):
+        assert name_in_commands(place) == "mine"
+        assert name_in_commands(str(tmp_path.parent / "mine")) == str(tmp_path.parent / "mine")
+    assert name_in_commands(place) == place
 
 
 def test_a_result_has_the_folder_of_a_sweep_that_has_one() -> None:

@@ -36,7 +36,7 @@ from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.service.telling import Teller
 from tune_jobs.service.turns import Turns
 from tune_jobs.service.watching import Watching
-from tune_jobs.store.command_names import default_storage
+from tune_jobs.store.command_names import served
 from tune_jobs.store.contract import Storage
 from tune_jobs.store.opening import open_storage
 
@@ -74,7 +74,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
         CannotRunError: Another service has this storage folder, it can't be written, the database can't be used, or
             nobody could come in.
     """
-    with _alone(config.folder), default_storage(config.place):
+    with _alone(config.folder), served(config.place):
         engine = open_database(config.database_url)
         try:
             gate = _gate(config, engine)

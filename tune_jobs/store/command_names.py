@@ -13,7 +13,8 @@ from policies.files import absolute
 from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
 DEFAULT_STORAGE = "sweeps"
-_VARIABLE = "TUNE_JOBS_STORAGE"
+_SERVED: list[str] = []
+"""The storages of services in this process."""
 
 
 def name_in_commands(place: str | Path) -> str:
@@ -32,23 +33,23 @@ def name_in_commands(place: str | Path) -> str:
 
 
 @contextlib.contextmanager
-def default_storage(place: str) -> Iterator[None]:
-    """Let a storage be this process's default in the block: its sweeps are named by their names.
+def served(storage: str) -> Iterator[None]:
+    """Name the sweeps of a storage by their names in the block: who is told how to go on asks the service that has it.
 
-    Who is told how to go on asks the service that does this, which knows its sweeps by their names.
+    Args:
+        storage: The storage's place, an absolute folder or a URL.
     """
-    before = os.environ.get(_VARIABLE)
-    os.environ[_VARIABLE] = place
+    _SERVED.append(storage)
     try:
         yield
     finally:
-        del os.environ[_VARIABLE]
-        if before is not None:
-            os.environ[_VARIABLE] = before
+        _SERVED.remove(storage)
 
 
 def _is_in_default(place: str) -> bool:
-    storage = os.environ.get(_VARIABLE) or DEFAULT_STORAGE
+    if outer_place(place) in _SERVED:
+        return True
+    storage = os.environ.get("TUNE_JOBS_STORAGE") or DEFAULT_STORAGE
     if is_url(place) or is_url(storage):
         return is_url(place) and outer_place(place) == storage
     # Where the working directory is gone, no relative folder is the sweep's.
