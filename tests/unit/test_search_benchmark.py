@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from tune_jobs.search.proposal import next_point
 
 TASK = TASKS["cartpole-ppo"]
 Formula = Callable[[Mapping[str, Any], int], float | None]
+Runner = Callable[[Task, str, int], Generator[list[Wanted], list[float | None], Run]]
 
 
 def lr_is_best_at_a_thousandth(point: Mapping[str, Any], seed: int) -> float | None:
@@ -33,10 +34,10 @@ def lr_is_best_at_a_thousandth(point: Mapping[str, Any], seed: int) -> float | N
 
 
 def played(
-    method: str, number: int, formula: Formula = lr_is_best_at_a_thousandth, task: Task = TASK
+    method: str, number: int, formula: Formula = lr_is_best_at_a_thousandth, task: Task = TASK, runner: Runner = run
 ) -> tuple[Run, list[list[Wanted]]]:
     """A run whose trainings are the formula, and what it asked for at each time."""
-    generator, asked = run(task, method, number), []
+    generator, asked = runner(task, method, number), []
     wanted = next(generator)
     while True:
         asked.append(wanted)
@@ -252,18 +253,6 @@ def test_the_time_limit_of_mountain_car_is_an_end() -> None:
     )
 
 
-def confirmed(method: str, number: int, formula: Formula) -> tuple[Run, list[list[Wanted]]]:
-    """The same as `played`, of a run as a sweep makes it."""
-    generator, asked = confirmed_runs.run(TASK, method, number), []
-    wanted = next(generator)
-    while True:
-        asked.append(wanted)
-        try:
-            wanted = generator.send([formula(item.point, item.seed) for item in wanted])
-        except StopIteration as end:
-            return end.value, asked
-
-
 def first_seed_flatters(point: Mapping[str, Any], seed: int) -> float | None:
     """What is far from the best has luck with its first seed, and fails with its second."""
     score = -abs(math.log10(point["lr"]) + 3)
@@ -274,7 +263,7 @@ def first_seed_flatters(point: Mapping[str, Any], seed: int) -> float | None:
 
 @pytest.mark.parametrize("method", list(confirmed_runs.CONFIRMED))
 def test_a_run_with_confirm_makes_as_many_trainings_and_names_no_lucky_setting(method: str) -> None:
-    found, asked = confirmed(method, 1, first_seed_flatters)
+    found, asked = played(method, 1, first_seed_flatters, runner=confirmed_runs.run)
     trained = [item for wanted in asked[:-1] for item in wanted]
     searched, raced = trained[:82], trained[82:]
     assert len(searched) == len(found.scores) == 82

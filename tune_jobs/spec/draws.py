@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
-
-import numpy as np
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from policies import random_streams
 from tune_jobs.spec.conditions import Conditions, in_order
 from tune_jobs.spec.domains import Domain, Grid
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
 
 MOST_COMBINATIONS = 1_000_000
 """Of grids with conditions, more than these are not counted; no sweep can have as many."""
@@ -97,47 +98,42 @@ def _all_different(
     known: list[set[str]] = [set() for _ in range(num_groups)]
     points = []
     for index, combination in enumerate(combinations):
-        rng, seen = random_streams.point_values(sweep_seed, index), known[index % num_groups]
-        points.append(_unseen(space, conditions, rng, combination, seen))
+        rng = random_streams.point_values(sweep_seed, index)
+        draws = _draws(space, conditions, rng, combination)
+        point = next(draws)
+        # Where nothing random acts there is one point.
+        if combination is None or any(space[name].is_random for name in point):
+            point = _unseen(point, draws, known[index % num_groups])
+        points.append(point)
     return points
 
 
-def _unseen(
-    space: Mapping[str, Domain],
-    conditions: Conditions,
-    rng: np.random.Generator,
-    combination: Mapping[str, Any] | None,
-    seen: set[str],
-) -> dict[str, Any]:
-    """Draw a point that is not among those seen, and add it; if there are hardly any others, forget these first."""
-    first = point = _drawn(space, conditions, rng, combination)
-    if combination is not None and not any(space[name].is_random for name in first):
-        return first
-    for _ in range(min(_MOST_DRAWS, 20 + 8 * len(seen))):
+def _unseen(first: dict[str, Any], others: Iterator[dict[str, Any]], seen: set[str]) -> dict[str, Any]:
+    """Return a point that is not among those seen, and add it; if there are hardly any others, forget these first."""
+    most = min(_MOST_DRAWS, 20 + 8 * len(seen))
+    for point in itertools.chain([first], itertools.islice(others, most - 1)):
         if (key := repr(point)) not in seen:
             seen.add(key)
             return point
-        point = _drawn(space, conditions, rng, combination)
     seen.clear()
     seen.add(repr(first))
     return first
 
 
-def _drawn(
-    space: Mapping[str, Domain],
-    conditions: Conditions,
-    rng: np.random.Generator,
-    combination: Mapping[str, Any] | None,
-) -> dict[str, Any]:
-    values = {}
-    for name, domain in space.items():
-        if combination is not None and isinstance(domain, Grid):
-            if name in combination:
-                values[name] = combination[name]
-        else:
-            # Drawn whether it acts or not, so that a condition changes no other value.
-            values[name] = domain.sample(rng)
-    return conditions.stripped(values)
+def _draws(
+    space: Mapping[str, Domain], conditions: Conditions, rng: Generator, combination: Mapping[str, Any] | None
+) -> Iterator[dict[str, Any]]:
+    """Yield random points of a combination without end."""
+    while True:
+        values = {}
+        for name, domain in space.items():
+            if combination is not None and isinstance(domain, Grid):
+                if name in combination:
+                    values[name] = combination[name]
+            else:
+                # Drawn whether it acts or not, so that a condition changes no other value.
+                values[name] = domain.sample(rng)
+        yield conditions.stripped(values)
 
 
 def _grids(space: Mapping[str, Domain]) -> dict[str, Grid]:

@@ -32,6 +32,12 @@ def name_in_commands(place: str | Path) -> str:
     return shlex.quote(place if is_url(place) else str(folder_of(place)))
 
 
+def watch_or_end(place: str | Path) -> str:
+    """Return the hint of a sweep that is being run: how it is watched, and how it is ended."""
+    named = name_in_commands(place)
+    return f"Watch it with `tune-jobs status {named}`, or end it with `tune-jobs stop {named}`."
+
+
 @contextlib.contextmanager
 def served(storage: str) -> Iterator[None]:
     """Name the sweeps of a storage by their names in the block: who is told how to go on asks the service that has it.

@@ -19,7 +19,7 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError, Spec
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
-from tune_jobs.store.command_names import name_in_commands
+from tune_jobs.store.command_names import name_in_commands, watch_or_end
 from tune_jobs.store.leftovers import remove_abandoned
 from tune_jobs.store.locks import held, is_held
 from tune_jobs.store.ownership import Owner
@@ -358,9 +358,8 @@ class SweepStore:
         Raises:
             CannotRunError: Another process holds it, or runs the sweep on a cluster.
         """
-        named = name_in_commands(self.place)
-        watch = f"Watch it with `tune-jobs status {named}`, or end it with `tune-jobs stop {named}`."
-        with held(self._lock_path, f"Sweep {self.name} is being run by another process.", watch):
+        told = f"Sweep {self.name} is being run by another process."
+        with held(self._lock_path, told, watch_or_end(self.place)):
             if is_held(self._driver_lock_path):
                 raise CannotRunError(*self._still_driven)
             yield

@@ -18,7 +18,7 @@ from typing import Any
 from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, SpecError
 from tune_jobs.store import names
-from tune_jobs.store.command_names import name_in_commands
+from tune_jobs.store.command_names import name_in_commands, watch_or_end
 from tune_jobs.store.objects.asked import Asked
 from tune_jobs.store.objects.at_once import AT_ONCE, side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError
@@ -219,8 +219,7 @@ class ObjectSweep(Artifacts):
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """Be the sweep's driver in the block; the lock is free half a minute after the process has ended."""
-        named = name_in_commands(self.place)
-        watch = f"Watch it with `tune-jobs status {named}`, or end it with `tune-jobs stop {named}`."
+        watch = watch_or_end(self.place)
         told = f"Sweep {self.name} is being run by another process."
         with (
             leased(self._bucket, _LOCK, told, watch, is_first=self._is_made) as beating,
@@ -322,7 +321,7 @@ def _answer(ask: Callable[[], bool]) -> bool:
 
 def name_taken(url: ObjectUrl) -> SpecError:
     """Return the error that a name is taken."""
-    go_on = f"continue it: `tune-jobs resume {name_in_commands(ObjectSweep(url).place)}`"
+    go_on = f"continue it: `tune-jobs resume {name_in_commands(str(url))}`"
     other = go_on if ObjectSweep(url).exists() else f"remove what is there: it has no {names.SWEEP_RECORD}"
     hint = f"Choose another name with --name, or {other}."
     return SpecError(f"A sweep {url.name!r} is already in {url.parent.short}.", hint)
