@@ -82,6 +82,12 @@ class StackedNetworks:
             start += _whole_lines(rows * columns)
         return views
 
+    @property
+    def multiplications_per_row(self) -> int:
+        """How often one network multiplies two numbers for the outputs of one row."""
+        windows = sum(math.prod(one.out) * one.window for one in self.convolutions)
+        return windows + sum(inputs * outputs for inputs, outputs in itertools.pairwise(self.sizes))
+
     def views_of(self, flat: Tensor) -> list[Tensor]:
         """Return views of a tensor of shape (K, P), layer by layer, as in `layers`."""
         return self._views(flat)
@@ -178,40 +184,3 @@ def with_ones(x: Floats) -> Floats:
     out[..., :-1] = x
     out[..., -1] = 1.0
     return out
-
-
-class ActingNetworks:
-    """The forward pass in NumPy, for the few rows of one env step: a call takes a third of torch's time.
-
-    Args:
-        networks: The networks whose weights are copied at each `refresh`.
-        num_acting: How many of the networks act, counted from the first.
-    """
-
-    def __init__(self, networks: StackedNetworks, num_acting: int) -> None:
-        self._networks, self._num_acting = networks, num_acting
-        self._activations = networks.activations.part(0, num_acting)
-        self._num_convolutions = len(networks.convolutions)
-        self._convolutions = StackedConvolutions(networks.convolutions, self._activations)
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Copy the present weights."""
-        self._layers = []
-        for layer in self._networks.layers:
-            values = layer[: self._num_acting].detach().cpu().numpy()
-            self._layers.append((values[:, :-1], values[:, -1:]))
-
-    def __call__(self, x: Floats) -> Floats:
-        """Return the outputs, shape (num_acting, B, A), for inputs of shape (num_acting, B, D)."""
-        num = self._num_convolutions
-        if num:
-            x = self._convolutions.forward_few(x, self._layers[:num])
-        for matrix, bias in self._layers[num:-1]:
-            x = np.matmul(x, matrix)
-            x += bias
-            x = self._activations.apply_to_few(x)
-        matrix, bias = self._layers[-1]
-        out: Floats = np.matmul(x, matrix)
-        out += bias
-        return out

@@ -18,11 +18,12 @@ from policies.errors import SpecError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
 from policies.networks.denormals import denormals_as_zero
 from policies.packed import optimizers
+from policies.packed.acting import ActingNetworks, ActingOnDevice
 from policies.packed.convolutions import convolutions_for
 from policies.packed.initial import new_member
 from policies.packed.inputs import Inputs
 from policies.packed.member import Member, group_members, network_layouts
-from policies.packed.networks import ActingNetworks, with_ones
+from policies.packed.networks import with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop
 from policies.packed.rows import StackedRows
 
@@ -95,8 +96,9 @@ def test_outputs_and_gradients_are_torchs(filters: tuple[Any, ...], activation: 
     evaluated = rows.networks.evaluate(inputs[: len(members)], len(members), 2 * len(members))
     # Not to the bit: weights that begin elsewhere in memory are multiplied by another kernel on some CPUs.
     np.testing.assert_allclose(evaluated, outputs[len(members) :], atol=ROUNDING)
-    acted = ActingNetworks(rows.networks, len(members))(images.reshape(len(members), B, -1).numpy())
-    np.testing.assert_allclose(acted, outputs[: len(members)], atol=ROUNDING)
+    for make in (ActingNetworks, ActingOnDevice):
+        acted = make(rows.networks, len(members))(images.reshape(len(members), B, -1).numpy())
+        np.testing.assert_allclose(acted, outputs[: len(members)], atol=ROUNDING)
     gradient = torch.zeros_like(outputs)
     for index, member in enumerate(members):
         for row, size, network in zip((index, len(members) + index), (3, 1), torch_networks(member), strict=True):

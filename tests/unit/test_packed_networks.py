@@ -16,8 +16,9 @@ from packed_members import NUM_INPUTS, NUM_OUTPUTS, Reference, random_member
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import PPOHyperparams
+from policies.packed.acting import ActingNetworks, ActingOnDevice
 from policies.packed.member import MAX_GROUP, group_members, network_layouts
-from policies.packed.networks import ActingNetworks, StackedNetworks, with_ones
+from policies.packed.networks import StackedNetworks, with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop
 from policies.packed.rows import StackedRows
 from policies.packed.sizes import is_padded_beside, size_class
@@ -110,14 +111,14 @@ def test_outputs_and_gradients_are_those_of_separate_modules(activation: str, nu
     x = observations(len(members))
     upstream = torch.randn(len(members), ROWS, NUM_OUTPUTS + 1, generator=torch.Generator().manual_seed(1))
     found = outputs_of(rows, x)
-    acting = ActingNetworks(rows.networks, len(members))(x.numpy())
+    acting = [make(rows.networks, len(members))(x.numpy()) for make in (ActingNetworks, ActingOnDevice)]
     evaluated = rows.networks.evaluate(stacked_inputs(rows, x)[: len(members)], 0, len(members))
     backward(rows, upstream)
     for index, member in enumerate(members):
         reference = Reference(member)
         expected = reference(x[index])
         close(found[index], expected.detach())
-        for other in (torch.from_numpy(acting[index]), evaluated[index]):
+        for other in (*(torch.from_numpy(each[index]) for each in acting), evaluated[index]):
             close(other[:, :NUM_OUTPUTS], expected[:, :NUM_OUTPUTS].detach())
         expected.backward(upstream[index])
         gradients = by_name(rows, rows.networks.gradients, members, index)

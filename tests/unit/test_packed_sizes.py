@@ -11,7 +11,8 @@ from networks_alone import check_alone
 
 from policies.activations import ACTIVATIONS
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
-from policies.packed.networks import ActingNetworks, StackedNetworks
+from policies.packed.acting import ActingNetworks
+from policies.packed.networks import StackedNetworks
 from policies.packed.sizes import may_round_by_place
 
 

@@ -16,11 +16,11 @@ from torch import Tensor
 from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import DQNHyperparams
 from policies.networks.denormals import denormals_as_zero
+from policies.packed.acting import make_acting
 from policies.packed.dqn import loss as dqn
 from policies.packed.dqn.replay import Drawn, StackedReplay
 from policies.packed.inputs import Inputs
 from policies.packed.member import TARGET_PREFIX, Member
-from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, StackedOptimizer, StackedRMSprop, clip_by_global_norm
 from policies.packed.rows import StackedRows
 from policies.packed.sampling import Observations
@@ -39,7 +39,8 @@ class DQNGroup:
         seen: What networks see of an observation, D numbers, behind a mask of A numbers if there is one.
         num_actions: The number of actions, A.
         replay: The replay memory that batches are drawn from.
-        device: Where the updates are computed; acting is on the CPU.
+        num_envs: The sub-environments of each member.
+        device: Where the updates are computed, and actions of large networks.
 
     Attributes:
         positions: The members' positions in their stack.
@@ -54,6 +55,7 @@ class DQNGroup:
         num_actions: int,
         replay: StackedReplay,
         *,
+        num_envs: int,
         device: str,
     ) -> None:
         self.members, self._shared = members, shared
@@ -70,7 +72,7 @@ class DQNGroup:
             self._targets = StackedRows(members, seen.shape, num_actions, device, TARGET_PREFIX)
         self._optimizer = self._make_optimizer()
         self._rows.read_moments(self._optimizer)
-        self._acting = ActingNetworks(self._networks, len(members))
+        self._acting = make_acting(self._networks, len(members), num_envs)
         self._grad_clip = self._column(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
         self._clips = any(item.grad_clip is not None for item in self._hyperparams)
         self._tau = self._column(lambda item: item.tau)

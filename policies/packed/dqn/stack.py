@@ -97,6 +97,7 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
                 self._seen,
                 self._num_actions,
                 self._replay,
+                num_envs=self.envs.num_envs,
                 device=self._device,
             )
             indices = np.array([places[member.member_id] for member in members], dtype=np.int64)

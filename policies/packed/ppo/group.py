@@ -18,9 +18,9 @@ from torch import Tensor
 from policies.envs.masks import FORBIDDEN
 from policies.hyperparams import PPOHyperparams
 from policies.networks.denormals import denormals_as_zero
+from policies.packed.acting import PrepareBytes, make_acting
 from policies.packed.inputs import Inputs
 from policies.packed.member import Member
-from policies.packed.networks import ActingNetworks
 from policies.packed.optimizers import StackedAdam, clip_by_global_norm
 from policies.packed.ppo import loss as ppo
 from policies.packed.rows import StackedRows
@@ -63,7 +63,8 @@ class PPOGroup:
         seen: What networks see of an observation, whose mask of actions has A numbers, or 0 if there is none.
         num_outputs: The number of outputs of the policy's head.
         heads: What those outputs mean.
-        device: Where the updates are computed; acting is on the CPU.
+        num_envs: The sub-environments of each member.
+        device: Where the updates are computed, and actions of large networks.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class PPOGroup:
         num_outputs: int,
         *,
         heads: ppo.Heads,
+        num_envs: int,
         device: str,
     ) -> None:
         self.members, self._shared = members, shared
@@ -92,7 +94,7 @@ class PPOGroup:
             epsilon=column(lambda _: _EPSILON),
         )
         self._rows.read_moments(self._optimizer)
-        self._acting = ActingNetworks(self._networks, len(members))
+        self._acting = make_acting(self._networks, len(members), num_envs)
         self._hyperparams = [member.hyperparams for member in members]
         self._unfinished: tuple[ppo.Parts, Tensor | None, int]
         self._grad_clip = self._per_member(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
@@ -114,9 +116,9 @@ class PPOGroup:
     def _per_member(self, value: Callable[[PPOHyperparams], float]) -> Tensor:
         return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=torch.float32)
 
-    def act(self, observations: Floats) -> Floats:
-        """Return the policy's outputs, (M, N, A), for prepared observations, (M, N, D)."""
-        outputs = self._acting(observations)
+    def act(self, observations: NDArray[Any], prepare_bytes: PrepareBytes | None = None) -> Floats:
+        """Return the policy's outputs, (M, N, A), for prepared observations, (M, N, D), or for bytes to be prepared."""
+        outputs = self._acting(observations, prepare_bytes)
         return outputs[..., : self._num_outputs] if self._shares else outputs
 
     def values(self, observations: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ with its mask if there is one, D that networks see, A outputs of the policy.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -24,7 +25,7 @@ from policies.envs.own_actions import sizes_of
 from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.vector import PackedEnvs
 from policies.packed.inputs import Inputs
-from policies.packed.member import Member, MemberStats, group_members
+from policies.packed.member import MAX_GROUP, Member, MemberStats, group_members
 from policies.packed.networks import with_ones
 from policies.packed.ppo.gae import advantages_and_targets, standardise
 from policies.packed.ppo.group import Batch, PPOGroup
@@ -66,7 +67,8 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         self._ended: list[tuple[tuple[float, int], ...]] = []
         self._returns: dict[str, NDArray[np.float64]] = {}
         """The discounted returns of running episodes, (N,), of members that normalise rewards."""
-        self._stream = torch.cuda.Stream() if device.startswith("cuda") else None  # type: ignore[no-untyped-call]
+        self._has_gpu = device.startswith("cuda")
+        self._stream = torch.cuda.Stream() if self._has_gpu else None  # type: ignore[no-untyped-call]
         space = envs.action_space
         self._heads = Heads(sizes_of(space))
         self._is_gaussian = self._heads.is_gaussian
@@ -88,7 +90,9 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         self._returns.pop(member_id, None)
 
     def _regroup(self) -> None:
-        groups = group_members(self.members)
+        # What a call costs on a GPU hardly depends on how many members are in it. Of images a group keeps too much.
+        is_one_call = self._has_gpu and not self._seen.is_image
+        groups = group_members(self.members, len(self.members) if is_one_call else MAX_GROUP)
         self.members = [member for group in groups for member in group]
         self.envs.arrange([member.member_id for member in self.members])
         self._groups = [
@@ -98,6 +102,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
                 self._seen,
                 self._num_outputs,
                 heads=self._heads,
+                num_envs=self.envs.num_envs,
                 device=self._device,
             )
             for group in groups
@@ -148,14 +153,22 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         noise = self._draw_noise(num_steps)
         envs.begin(num_steps)
         bounds = np.cumsum([0, *(len(group.members) for group in self._groups)]).tolist()
+        # Where a GPU is, bytes are prepared by what acts, so that they may go there as such.
+        prepares = [
+            self._observations.part(start, stop).prepare_bytes if self._has_gpu and self._seen.is_bytes else None
+            for start, stop in itertools.pairwise(bounds)
+        ]
         outputs = fragment.outputs.reshape(num_steps, num_members, num_envs, self._num_outputs)
         chosen = []
         for step in range(num_steps):
             observations = fragment.observations[step]
             observations[:] = envs.observations.reshape(observations.shape)
-            seen = self._observations.prepare(observations)
-            for group, start, stop in zip(self._groups, bounds, bounds[1:], strict=False):
-                outputs[step, start:stop] = group.act(seen[start:stop])
+            if prepares[0]:
+                seen = observations.reshape(num_members, num_envs, -1)
+            else:
+                seen = self._observations.prepare(observations)
+            for group, prepare, start, stop in zip(self._groups, prepares, bounds, bounds[1:], strict=False):
+                outputs[step, start:stop] = group.act(seen[start:stop], prepare)
             if self._num_masked:
                 mask_outputs(fragment.outputs[step], fragment.observations[step], self._num_masked)
             actions = self._choose(fragment.outputs[step], noise[step])
