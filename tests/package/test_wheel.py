@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A clean environment's bin folder, with the wheel and what it says that it depends on, at the tested versions."""
     folder = tmp_path_factory.mktemp("wheel")
-    call([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)], folder)
+    call([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(copy_of_sources(folder))], folder)
     (wheel,) = folder.glob("*.whl")
     venv.create(folder / "venv")
     binaries = folder / "venv" / "bin"
@@ -37,6 +37,21 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         link_files(needed, packages)
     call([*pip, "check"], folder)
     return binaries
+
+
+def copy_of_sources(folder: Path) -> Path:
+    """Copy what a wheel is built of.
+
+    What an earlier build left in the repository would be packed again, though it is moved or no longer named in
+    pyproject.toml; and others may be writing there.
+    """
+    sources = folder / "sources"
+    sources.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, sources)
+    for name in ("tune_jobs", "policies", "analysis"):
+        shutil.copytree(ROOT / name, sources / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return sources
 
 
 def needed_by(installed: Distribution) -> list[Distribution]:
