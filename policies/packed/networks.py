@@ -73,6 +73,12 @@ class StackedNetworks:
         self.gradient_layers = self._views(self.gradients)
         self.activations = StackedActivations(activations)
         self._stacked = StackedConvolutions(convolutions, self.activations)
+        num = len(self.convolutions)
+        self._dense = [_Dense(layer) for layer in self.layers[num:]]
+        self._dense_gradients = [
+            _Gradients(layer, with_ones=not (number or num)) for number, layer in enumerate(self.gradient_layers[num:])
+        ]
+        self._parts: dict[tuple[int, int], tuple[list[Tensor], list[_Dense]]] = {}
         self._kept: list[tuple[Tensor, Kept]] = []
 
     def _views(self, flat: Tensor) -> list[Tensor]:
@@ -101,11 +107,11 @@ class StackedNetworks:
         num = len(self.convolutions)
         if num:
             x = self._stacked.forward(x, self.layers[:num])
-        for number, layer in enumerate(self.layers[num:-1]):
+        for number, layer in enumerate(self._dense[:-1]):
             # The column of ones makes the first bias a part of the product.
-            x = self._activate(x, _product(x, layer) if number or num else torch.bmm(x, layer))
+            x = self._activate(x, layer.product(x) if number or num else torch.bmm(x, layer.whole))
         self._kept.append((x, x))
-        return _product(x, self.layers[-1])
+        return self._dense[-1].product(x)
 
     def _activate(self, inputs: Tensor, x: Tensor) -> Tensor:
         out, kept = self.activations.apply(x)
@@ -114,59 +120,89 @@ class StackedNetworks:
 
     def evaluate(self, x: Tensor, start: int, stop: int) -> Tensor:
         """Return the outputs of only the networks from start to stop; nothing is kept for a `backward`."""
-        num = len(self.convolutions)
-        layers, activations = [layer[start:stop] for layer in self.layers], self.activations.part(start, stop)
-        if num:
-            x = self._stacked.evaluate(x, layers[:num], activations)
-            x = _product(x, layers[num])
+        convolutions, dense = self._part(start, stop)
+        activations = self.activations.part(start, stop)
+        if convolutions:
+            x = self._stacked.evaluate(x, convolutions, activations)
+            x = dense[0].product(x)
         else:
-            x = torch.bmm(x, layers[0])
-        for layer in layers[num + 1 :]:
+            x = torch.bmm(x, dense[0].whole)
+        for layer in dense[1:]:
             x, _ = activations.apply(x)
-            x = _product(x, layer)
+            x = layer.product(x)
         return x
+
+    def _part(self, start: int, stop: int) -> tuple[list[Tensor], list[_Dense]]:
+        """Return the convolutions and the dense layers of only the networks from start to stop."""
+        if (start, stop) not in self._parts:
+            num = len(self.convolutions)
+            layers = [layer[start:stop] for layer in self.layers]
+            self._parts[start, stop] = layers[:num], [_Dense(layer) for layer in layers[num:]]
+        return self._parts[start, stop]
 
     def backward(self, gradient: Tensor) -> None:
         """Set `gradients` from the gradient of the outputs of the last `forward`, shape (K, B, A)."""
         num = len(self.convolutions)
-        dense, gradients = self.layers[num:], self.gradient_layers[num:]
         x, _ = self._kept[-1]
-        _set_gradients(gradients[-1], x, gradient)
-        for number in range(len(dense) - 2, -1, -1):
-            gradient = torch.bmm(gradient, dense[number + 1][:, :-1].transpose(1, 2))
+        self._dense_gradients[-1].set(x, gradient)
+        for number in range(len(self._dense) - 2, -1, -1):
+            gradient = self._dense[number + 1].gradient_of_inputs(gradient)
             x, kept = self._kept[number]
             gradient = self.activations.gradient(gradient, kept)
-            if number or num:
-                _set_gradients(gradients[number], x, gradient)
-            else:
-                _product_of_rows(x, gradient, gradients[0])
+            self._dense_gradients[number].set(x, gradient)
         if num:
-            gradient = torch.bmm(gradient, dense[0][:, :-1].transpose(1, 2))
+            gradient = self._dense[0].gradient_of_inputs(gradient)
             self._stacked.backward(gradient, self.layers[:num], self.gradient_layers[:num])
         self._kept = []
 
 
-def _product(x: Tensor, layer: Tensor) -> Tensor:
-    """Return the outputs of a layer, shape (K, B, outputs), for inputs of shape (K, B, inputs)."""
-    if _is_narrow(layer):
-        values = layer.numpy()
-        out = np.matmul(x.numpy(), values[:, :-1])
-        out += values[:, -1:]
-        return torch.from_numpy(out)
-    return torch.baddbmm(layer[:, -1:], x, layer[:, :-1])
+class _Dense:
+    """A dense layer of some networks, whose weights are views, (K, inputs + 1, outputs), the biases last.
+
+    What is the same at each call is found once: a view of a tensor takes as long as a small layer's product.
+    """
+
+    def __init__(self, layer: Tensor) -> None:
+        self.whole, self._matrix, self._biases = layer, layer[:, :-1], layer[:, -1:]
+        self._transposed = self._matrix.transpose(1, 2)
+        self._is_narrow = _is_narrow(layer)
+        if self._is_narrow:
+            self._matrix_array, self._biases_array = self._matrix.numpy(), self._biases.numpy()
+
+    def product(self, x: Tensor) -> Tensor:
+        """Return the outputs, (K, B, outputs), for inputs of shape (K, B, inputs)."""
+        if self._is_narrow:
+            out = np.matmul(x.numpy(), self._matrix_array)
+            out += self._biases_array
+            return torch.from_numpy(out)
+        return torch.baddbmm(self._biases, x, self._matrix)
+
+    def gradient_of_inputs(self, gradient: Tensor) -> Tensor:
+        """Return the gradient of the inputs, (K, B, inputs), from that of the outputs."""
+        return torch.bmm(gradient, self._transposed)
 
 
-def _set_gradients(views: Tensor, x: Tensor, gradient: Tensor) -> None:
-    _product_of_rows(x, gradient, views[:, :-1])
-    torch.sum(gradient, dim=1, out=views[:, -1])
+class _Gradients:
+    """The gradients of a dense layer, in the same form as its weights.
 
+    Args:
+        layer: What they are written into.
+        with_ones: Whether the inputs have a last column of ones, so that those of the biases come of the product, too.
+    """
 
-def _product_of_rows(x: Tensor, gradient: Tensor, out: Tensor) -> None:
-    """Write the gradients of a matrix, shape (K, inputs, outputs), from its inputs and the gradients of its outputs."""
-    if _is_narrow(out):
-        np.matmul(x.numpy().swapaxes(1, 2), gradient.numpy(), out=out.numpy())
-    else:
-        torch.bmm(x.transpose(1, 2), gradient, out=out)
+    def __init__(self, layer: Tensor, *, with_ones: bool) -> None:
+        self._of_product = layer if with_ones else layer[:, :-1]
+        self._of_biases = None if with_ones else layer[:, -1]
+        self._array = self._of_product.numpy() if _is_narrow(self._of_product) else None
+
+    def set(self, x: Tensor, gradient: Tensor) -> None:
+        """Write them, from the inputs, (K, B, inputs), and the gradient of the outputs, (K, B, outputs)."""
+        if self._array is not None:
+            np.matmul(x.numpy().swapaxes(1, 2), gradient.numpy(), out=self._array)
+        else:
+            torch.bmm(x.transpose(1, 2), gradient, out=self._of_product)
+        if self._of_biases is not None:
+            torch.sum(gradient, dim=1, out=self._of_biases)
 
 
 def _is_narrow(layer: Tensor) -> bool:

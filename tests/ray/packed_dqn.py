@@ -16,12 +16,11 @@ from packed_rllib import MODULE, difference, learner_of, state_of
 
 from policies.hyperparams import DQNHyperparams
 from policies.packed.dqn import loss as dqn
-from policies.packed.dqn.group import DQNGroup
-from policies.packed.dqn.replay import Drawn
+from policies.packed.dqn.group import Batch, DQNGroup
+from policies.packed.dqn.replay import Drawn, Indices
 from policies.packed.envs.vector import EnvKind
 from policies.packed.inputs import Inputs
 from policies.packed.member import Member, Weights
-from policies.packed.sampling import Observations
 from policies.replay import Transitions
 
 if TYPE_CHECKING:
@@ -153,18 +152,26 @@ def follow(group: DQNGroup, found: dict[str, Learned]) -> contextlib.ExitStack:
     """Write down what each of a group's updates gives; returns what ends that."""
     stack = contextlib.ExitStack()
     update, move, gradient = group._update, group._update_targets, dqn.loss_gradient
-    losses = []
+    draw = group._replay.draw
+    losses: list[dqn.Loss] = []
+    raw: list[NDArray[np.float32]] = []
 
     def spied_gradient(*args: Any) -> dqn.Loss:
         losses.append(gradient(*args))
         return losses[-1]
 
-    def spied_update(drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
-        rows = drawn.rows.copy()
-        stats = update(drawn, observations, wants_stats=True)
+    def spied_draw(slots: Indices, numbers: NDArray[np.float64]) -> Drawn:
+        drawn = draw(slots, numbers)
+        # As they are in the memory, before they are prepared in place.
+        raw.extend(drawn.rows.copy().reshape(-1, *drawn.rows.shape[-3:]))
+        return drawn
+
+    def spied_update(batch: Batch, *, wants_stats: bool) -> list[dict[str, float]]:
+        rows = raw.pop(0)
+        stats = update(batch, wants_stats=True)
         for index, member in enumerate(group.members):
             one = found[member.member_id]
-            weights = None if drawn.weights is None else drawn.weights[index].copy()
+            weights = None if batch.weights is None else batch.weights[index].numpy().copy()
             one.batches.append(as_transitions(rows[index], group._seen, weights))
             one.losses.append(stats[index]["total_loss"])
             one.lrs.append(stats[index]["lr"])
@@ -179,6 +186,7 @@ def follow(group: DQNGroup, found: dict[str, Learned]) -> contextlib.ExitStack:
             found[member.member_id].weights.append(copy.deepcopy(member.weights))
 
     stack.enter_context(patch.object(dqn, "loss_gradient", spied_gradient))
+    stack.enter_context(patch.object(group._replay, "draw", spied_draw))
     stack.enter_context(patch.object(group, "_update", spied_update))
     stack.enter_context(patch.object(group, "_update_targets", spied_move))
     return stack

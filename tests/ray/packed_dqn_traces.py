@@ -17,10 +17,8 @@ from packed_dqn_cases import arrives
 
 from policies.hyperparams import DQNHyperparams
 from policies.networks.epsilon import EpsilonSchedule
-from policies.packed.dqn.group import DQNGroup
-from policies.packed.dqn.replay import Drawn
+from policies.packed.dqn.group import Batch, DQNGroup
 from policies.packed.envs.vector import Step
-from policies.packed.sampling import Observations
 from policies.replay import ReplayBuffer, Transitions
 
 
@@ -73,11 +71,9 @@ def pack_trace(num_iterations: int, values: dict[str, Any]) -> Trace:
         trace.phases.append((member.num_env_steps, len(numbers), rounded(self._optimizer.lr)))
         return found
 
-    def spied_update(
-        self: DQNGroup, drawn: Drawn, observations: Observations, *, wants_stats: bool
-    ) -> list[dict[str, float]]:
-        trace.sizes.add(drawn.rows.shape[1])
-        return update(self, drawn, observations, wants_stats=wants_stats)
+    def spied_update(self: DQNGroup, batch: Batch, *, wants_stats: bool) -> list[dict[str, float]]:
+        trace.sizes.add(batch.now.shape[1])
+        return update(self, batch, wants_stats=wants_stats)
 
     def spied_move(self: DQNGroup, num_steps_after: float) -> None:
         before = member.num_target_updates

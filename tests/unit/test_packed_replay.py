@@ -192,6 +192,22 @@ def test_no_replay_gives_the_newest_rows_in_order() -> None:
     assert found.tolist() == [[3, 4, 5, 6, 7, 8], [103, 104, 105, 106, 107, 108]]
 
 
+@pytest.mark.parametrize("replay", ["uniform", "none"])
+def test_several_batches_at_once_are_those_of_one_after_another(replay: str) -> None:
+    stacked = stack_of(replay, ("a", {}), ("b", {"replay_capacity": 40}))
+    put(stacked, ["a", "b"], transitions(0, 20), transitions(100, 20))
+    slots, numbers = stacked.slots(["b", "a"]), np.random.default_rng(0).random((3, 2, BATCH))
+    assert stacked.draws_ahead
+    together = stacked.draw(slots, numbers).rows
+    assert together.shape == (3, 2, BATCH, stacked.num_columns)
+    for found, own in zip(together, numbers, strict=True):
+        np.testing.assert_array_equal(found, stacked.draw(slots, own).rows)
+
+
+def test_priorities_decide_what_is_drawn_next() -> None:
+    assert not stack_of("prioritized").draws_ahead
+
+
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "none"])
 def test_a_slot_that_is_used_again_holds_nothing_of_the_member_before(replay: str) -> None:
     # Also where its new member holds less, or the array has grown meanwhile.

@@ -6,7 +6,8 @@ Shapes: M members, N sub-environments per member, B rows per batch, D numbers pe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from policies.hyperparams import DQNHyperparams
 from policies.networks.denormals import denormals_as_zero
 from policies.packed.acting import make_acting
 from policies.packed.dqn import loss as dqn
-from policies.packed.dqn.replay import Drawn, StackedReplay
+from policies.packed.dqn.replay import Indices, StackedReplay
 from policies.packed.inputs import Inputs
 from policies.packed.member import TARGET_PREFIX, Member
 from policies.packed.optimizers import StackedAdam, StackedOptimizer, StackedRMSprop, clip_by_global_norm
@@ -28,6 +29,31 @@ from policies.packed.shared import SharedByDQN
 from policies.schedules import linear
 
 Floats = NDArray[np.float32]
+
+
+_NUMBERS_AT_ONCE = 65_536
+"""The most numbers of batches that are drawn at once: they are read back soon, from a cache."""
+
+
+class Batch(NamedTuple):
+    """What an update learns from, member by member."""
+
+    now: Tensor
+    """What networks see, with a last column of ones, (M, B, D + 1), or of images (M, B, D)."""
+    later: Tensor
+    """What they see next."""
+    masks: Tensor | None
+    """Which actions are allowed next, (M, B, A); None: all."""
+    actions: Tensor
+    """Whole numbers, (M, B)."""
+    rewards: Tensor
+    """The rewards of n steps, (M, B)."""
+    discounts: Tensor
+    """What the next value counts, 0 after an end, (M, B)."""
+    weights: Tensor | None
+    """Importance weights, (M, B); None: all 1."""
+    indices: Indices | None
+    """Where the rows are in the replay memory, (M, B), if their priorities are to be set."""
 
 
 class DQNGroup:
@@ -121,13 +147,11 @@ class DQNGroup:
         if self._has_schedule:
             self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
         num_updates = len(numbers)
-        observations = Observations(self.members, 1, normalizes=self._shared.normalize_observations, seen=self._seen)
         self._optimizer.begin(num_updates)
         stats: list[dict[str, float]] = []
-        for number in range(num_updates):
-            drawn = self._replay.draw(self._slots, numbers[number])
+        for number, batch in enumerate(self._batches(numbers)):
             is_last = wants_stats and number == num_updates - 1
-            stats = self._update(drawn, observations, wants_stats=is_last)
+            stats = self._update(batch, wants_stats=is_last)
             self._update_targets(num_new_steps * (1 - (number + 1) / num_updates))
         for member in self.members:
             member.num_updates += num_updates
@@ -138,37 +162,52 @@ class DQNGroup:
         item = member.hyperparams
         return linear(item.lr, item.lr_final, item.lr_decay_steps, member.num_env_steps)
 
-    def _update(self, drawn: Drawn, observations: Observations, *, wants_stats: bool) -> list[dict[str, float]]:
-        shared = self._shared
-        batch, now, later, masks = self._observed(drawn, observations)
-        actions, rewards, discounts = batch[..., -3].long(), batch[..., -2], batch[..., -1]
-        weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
-        targets = rewards + discounts * self._next_values(later, masks, uses_double_q=shared.double_q)
-        loss = dqn.loss_gradient(self._networks.forward(now), actions, targets, weights, shared)
+    def _batches(self, numbers: NDArray[np.float64]) -> Iterator[Batch]:
+        """Yield the batch of each update; as many as fit a cache are drawn at once, if the memory draws ahead."""
+        observations = Observations(self.members, 1, normalizes=self._shared.normalize_observations, seen=self._seen)
+        ahead = self._replay.draws_ahead
+        size = self._replay.num_columns * numbers[0].size
+        at_once = max(1, _NUMBERS_AT_ONCE // size) if ahead else 1
+        for start in range(0, len(numbers), at_once):
+            drawn = self._replay.draw(self._slots, numbers[start : start + at_once] if ahead else numbers[start])
+            rows = drawn.rows if ahead else drawn.rows[None]
+            if not self._seen.is_bytes:
+                for first in (0, self._seen.num_columns):
+                    observations.prepare_columns(rows[..., first : first + self._seen.num_columns])
+            batches = torch.from_numpy(rows).to(self._device)
+            weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
+            actions, rewards, discounts = batches[..., -3].long(), batches[..., -2], batches[..., -1]
+            for number, batch in enumerate(batches):
+                now, later, masks = self._observed(batch, observations)
+                yield Batch(
+                    now, later, masks, actions[number], rewards[number], discounts[number], weights, drawn.indices
+                )
+
+    def _update(self, batch: Batch, *, wants_stats: bool) -> list[dict[str, float]]:
+        shared, weights = self._shared, batch.weights
+        next_values = self._next_values(batch.later, batch.masks, uses_double_q=shared.double_q)
+        targets = batch.rewards + batch.discounts * next_values
+        loss = dqn.loss_gradient(self._networks.forward(batch.now), batch.actions, targets, weights, shared)
         self._networks.backward(loss.gradient)
         norms = None
         if self._clips:
             norms = clip_by_global_norm(self._networks.gradients, self._grad_clip, 1)
         self._optimizer.step(self._networks.gradients)
-        if drawn.indices is not None:
-            self._replay.set_priorities(self._slots, drawn.indices, loss.td_errors.cpu().numpy())
+        if batch.indices is not None:
+            self._replay.set_priorities(self._slots, batch.indices, loss.td_errors.cpu().numpy())
         if not wants_stats:
             return []
         return self._stats(dqn.mean_loss(loss.td_errors, weights, shared), loss.q_selected.mean(dim=1), norms)
 
-    def _observed(self, drawn: Drawn, observations: Observations) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Return a batch's rows, what networks see now and next, (M, B, D or more), and the next masks, if any."""
+    def _observed(self, batch: Tensor, observations: Observations) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return what networks see in a batch's rows now and next, (M, B, D or more), and the next masks, if any."""
         middle, num_masked = self._seen.num_columns, self._seen.num_masked
         if self._seen.is_bytes:
-            batch = torch.from_numpy(drawn.rows).to(self._device)
             parts = batch[..., :middle], batch[..., middle : 2 * middle]
             now, later = (observations.prepare_bytes(self._seen.bytes_in_tensor(part)) for part in parts)
-            return batch, now, later, None
-        for start in (0, middle):
-            observations.prepare_columns(drawn.rows[..., start : start + middle])
-        batch = torch.from_numpy(drawn.rows).to(self._device)
+            return now, later, None
         masks = batch[..., middle : middle + num_masked] if num_masked else None
-        return batch, batch[..., num_masked:middle], batch[..., middle + num_masked : 2 * middle], masks
+        return batch[..., num_masked:middle], batch[..., middle + num_masked : 2 * middle], masks
 
     def _next_values(self, later: Tensor, masks: Tensor | None, *, uses_double_q: bool) -> Tensor:
         """Return Q' of the best next action that the masks, (M, B, A), allow, (M, B)."""

@@ -28,10 +28,10 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A batch for each of M members."""
+    """A batch for each of M members, or U of them."""
 
     rows: Floats
-    """The transitions, (M, B, columns)."""
+    """The transitions, (M, B, columns) or (U, M, B, columns)."""
     weights: Floats | None = None
     """Importance weights, (M, B); None: all 1."""
     indices: Indices | None = None
@@ -45,6 +45,9 @@ class StackedReplay:
         shared: The hyperparameters that all members share.
         seen: What networks see of an observation.
     """
+
+    draws_ahead = True
+    """Whether what is drawn has no part in what the updates before it do, so that U batches may be drawn at once."""
 
     def __init__(self, shared: SharedByDQN, seen: Inputs) -> None:
         self._newest_only = shared.replay == "none"
@@ -119,16 +122,17 @@ class StackedReplay:
         self._size[slots] = np.minimum(self._capacity[slots], self._size[slots] + num_new)
 
     def draw(self, slots: Indices, numbers: NDArray[np.float64]) -> Drawn:
-        """Return a batch for each of some members.
+        """Return a batch for each of some members, or U of them.
 
         Args:
             slots: The members' slots, (M,).
-            numbers: Random numbers, uniform in [0, 1), (M, B); not used where the newest transitions are taken.
+            numbers: Random numbers, uniform in [0, 1), (M, B), or (U, M, B) if the memory `draws_ahead`; not used where
+                the newest transitions are taken.
         """
         if self._newest_only:
-            places = (self._next[slots, None] - numbers.shape[1] + np.arange(numbers.shape[1])) % self._capacity[
-                slots, None
-            ]
+            num_rows = numbers.shape[-1]
+            newest = (self._next[slots, None] - num_rows + np.arange(num_rows)) % self._capacity[slots, None]
+            places = np.broadcast_to(newest, numbers.shape)
         else:
             places = (numbers * self._size[slots, None]).astype(np.int64)
         return Drawn(self._gather(slots, places))
@@ -145,6 +149,8 @@ class StackedReplay:
 
 class StackedPrioritizedReplay(StackedReplay):
     """Draws in proportion to (|TD error| + epsilon)^alpha; see `policies.replay.PrioritizedReplayBuffer`."""
+
+    draws_ahead = False
 
     def __init__(self, shared: SharedByDQN, seen: Inputs) -> None:
         super().__init__(shared, seen)
