@@ -17,6 +17,7 @@ from torch import Tensor
 
 _NUMBERS_AT_ONCE = 98_304
 """How many weights are moved at once: with their gradients, moments and quotients, they are two megabytes."""
+_STEPS_AHEAD = 128
 FUSED_FROM = 16_384
 """The weights of a network from which on Adam is torch's own fused step, which goes over them once and not ten times.
 It is called for each member; networks with fewer are as fast all together."""
@@ -59,6 +60,8 @@ class StackedAdam:
         self.state = {"exp_avg": torch.zeros_like(weights), "exp_avg_sq": torch.zeros_like(weights)}
         self.num_steps = torch.zeros_like(lr, dtype=torch.float64)
         self._rates: list[tuple[Tensor, Tensor]] = []
+        self._known: tuple[list[float], Tensor, Tensor] | None = None
+        """The numbers of steps before them, and the corrections of the steps that follow, (steps, K, 1) each."""
         # By the weights of one network alone: how many are in a stack has no part in how they are rounded.
         self._fused = _FusedSteps(self) if weights.shape[1] >= FUSED_FROM and can_fuse(weights.device.type) else None
 
@@ -67,14 +70,33 @@ class StackedAdam:
         if self._fused is not None:
             self._fused.begin(num_updates)
             return
-        counts = self.num_steps + torch.arange(num_updates, 0, -1, dtype=torch.float64, device=self.lr.device).view(
-            -1, 1, 1
-        )
-        correction1, correction2 = 1 - self.beta1**counts, 1 - self.beta2**counts
+        correction1, scales = self._corrections_of(num_updates)
         rates = (self.lr.double() / correction1).float()
-        scales = correction2.rsqrt().float()
         # They are popped from the end of the list, so the first step comes last.
-        self._rates = list(zip(rates.unbind(0), scales.unbind(0), strict=True))
+        self._rates = list(zip(rates.flip(0).unbind(0), scales.flip(0).unbind(0), strict=True))
+
+    def _corrections_of(self, num_updates: int) -> tuple[Tensor, Tensor]:
+        """Return what rates are divided by and denominators multiplied by in the next steps, (num_updates, K, 1).
+
+        On a CPU they are computed ahead, as phases of DQN have few updates.
+        """
+        if self.lr.is_cuda:
+            return self._corrections_from_now(num_updates)
+        now = self.num_steps[:, 0].tolist()
+        if self._known is not None:
+            before, correction1, scales = self._known
+            done = int(now[0] - before[0])
+            is_known = 0 <= done <= len(scales) - num_updates and now == [count + done for count in before]
+            if is_known:
+                return correction1[done : done + num_updates], scales[done : done + num_updates]
+        correction1, scales = self._corrections_from_now(num_updates + _STEPS_AHEAD)
+        self._known = now, correction1, scales
+        return correction1[:num_updates], scales[:num_updates]
+
+    def _corrections_from_now(self, num_updates: int) -> tuple[Tensor, Tensor]:
+        steps = torch.arange(1, num_updates + 1, dtype=torch.float64, device=self.lr.device).view(-1, 1, 1)
+        counts = self.num_steps + steps
+        return 1 - self.beta1**counts, (1 - self.beta2**counts).rsqrt().float()
 
     def step(self, gradients: Tensor) -> None:
         """Update the weights by one step of Adam."""

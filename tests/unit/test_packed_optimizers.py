@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
@@ -10,7 +11,14 @@ import pytest
 import torch
 
 from policies.packed import optimizers
-from policies.packed.optimizers import FUSED_FROM, StackedAdam, StackedRMSprop, can_fuse, clip_by_global_norm
+from policies.packed.optimizers import (
+    _STEPS_AHEAD,
+    FUSED_FROM,
+    StackedAdam,
+    StackedRMSprop,
+    can_fuse,
+    clip_by_global_norm,
+)
 from tests.rounding import assert_rounded, close
 
 if TYPE_CHECKING:
@@ -221,3 +229,31 @@ def test_what_is_no_number_stays_so_under_clipping_and_stays_where_it_is() -> No
     assert gradients[0].isnan().all()
     norm = math.sqrt(NUM_WEIGHTS)
     close(gradients[1].norm(), norm / (norm + 1e-6))
+
+
+def test_corrections_that_were_computed_ahead_are_those_of_the_steps() -> None:
+    """Past the last that is known, in phases of any length, and where the numbers of steps were set meanwhile."""
+    rng = torch.Generator().manual_seed(0)
+    beta1, beta2 = (as_columns(values, torch.float64) for values in ([0.9, 0.5, 0.0], [0.999, 0.9, 0.99]))
+
+    def moved(gradients: torch.Tensor, *, ahead: bool) -> torch.Tensor:
+        adam = StackedAdam(
+            torch.zeros(3, 2), as_columns([1e-3, 0.1, 0.2]), beta1, beta2, as_columns([1e-8, 1e-3, 1e-8])
+        )
+        adam.num_steps[1] += 5
+        lengths = itertools.cycle((1, 4, 7, 40, 2))
+        number = 0
+        while number < len(gradients):
+            length = min(next(lengths), len(gradients) - number)
+            if number == 12:
+                adam.num_steps[2] = 1
+            if not ahead:
+                adam._known = None
+            adam.begin(length)
+            for gradient in gradients[number : number + length]:
+                adam.step(gradient)
+            number += length
+        return adam.weights
+
+    gradients = torch.randn(3 * _STEPS_AHEAD, 3, 2, generator=rng)
+    torch.testing.assert_close(moved(gradients, ahead=True), moved(gradients, ahead=False), rtol=0, atol=0)
