@@ -5,6 +5,7 @@ Shapes: M members, N sub-environments per member, B rows per batch, D numbers pe
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -42,14 +43,14 @@ class Batch(NamedTuple):
     """What networks see, with a last column of ones, (M, B, D + 1), or of images (M, B, D)."""
     later: Tensor
     """What they see next."""
-    masks: Tensor | None
-    """Which actions are allowed next, (M, B, A); None: all."""
     actions: Tensor
     """Whole numbers, (M, B)."""
     rewards: Tensor
     """The rewards of n steps, (M, B)."""
     discounts: Tensor
     """What the next value counts, 0 after an end, (M, B)."""
+    masks: Tensor | None
+    """Which actions are allowed next, (M, B, A); None: all."""
     weights: Tensor | None
     """Importance weights, (M, B); None: all 1."""
     indices: Indices | None
@@ -103,6 +104,7 @@ class DQNGroup:
         self._clips = any(item.grad_clip is not None for item in self._hyperparams)
         self._tau = self._column(lambda item: item.tau)
         self._copies = all(item.tau == 1.0 for item in self._hyperparams)
+        self._moves_always = all(item.target_update_interval is None for item in self._hyperparams)
         self._has_schedule = any(item.lr_final is not None for item in self._hyperparams)
 
     def _column(self, value: Callable[[DQNHyperparams], float], dtype: torch.dtype = torch.float32) -> Tensor:
@@ -145,7 +147,8 @@ class DQNGroup:
             For each member, the metrics of the last update; empty if they are not wanted.
         """
         if self._has_schedule:
-            self._optimizer.lr = torch.tensor([[self._lr(member)] for member in self.members], device=self._device)
+            lrs = np.array([[self._lr(member)] for member in self.members], dtype=np.float32)
+            self._optimizer.lr = torch.from_numpy(lrs).to(self._device)
         num_updates = len(numbers)
         self._optimizer.begin(num_updates)
         stats: list[dict[str, float]] = []
@@ -176,11 +179,13 @@ class DQNGroup:
                     observations.prepare_columns(rows[..., first : first + self._seen.num_columns])
             batches = torch.from_numpy(rows).to(self._device)
             weights = None if drawn.weights is None else torch.from_numpy(drawn.weights).to(self._device)
-            actions, rewards, discounts = batches[..., -3].long(), batches[..., -2], batches[..., -1]
-            for number, batch in enumerate(batches):
-                now, later, masks = self._observed(batch, observations)
+            seen, seen_next, masks = self._observed(batches, observations)
+            parts = (seen, seen_next, batches[..., -3].long(), batches[..., -2], batches[..., -1])
+            now, later, actions, rewards, discounts = (part.unbind(0) for part in parts)
+            for at in range(len(batches)):
+                own_masks = None if masks is None else masks[at]
                 yield Batch(
-                    now, later, masks, actions[number], rewards[number], discounts[number], weights, drawn.indices
+                    now[at], later[at], actions[at], rewards[at], discounts[at], own_masks, weights, drawn.indices
                 )
 
     def _update(self, batch: Batch, *, wants_stats: bool) -> list[dict[str, float]]:
@@ -200,7 +205,7 @@ class DQNGroup:
         return self._stats(dqn.mean_loss(loss.td_errors, weights, shared), loss.q_selected.mean(dim=1), norms)
 
     def _observed(self, batch: Tensor, observations: Observations) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return what networks see in a batch's rows now and next, (M, B, D or more), and the next masks, if any."""
+        """Return what networks see in rows of batches now and next, and the next masks, if any, (U, M, B, ...)."""
         middle, num_masked = self._seen.num_columns, self._seen.num_masked
         if self._seen.is_bytes:
             parts = batch[..., :middle], batch[..., middle : 2 * middle]
@@ -226,6 +231,11 @@ class DQNGroup:
         """Update the target networks that are due; `num_steps_after` env steps of the phase follow this update."""
         if self._targets is None:
             return
+        if self._moves_always:
+            for member in self.members:
+                member.num_target_updates += 1
+            self._move_targets(list(range(len(self.members))))
+            return
         due = []
         for index, (member, item) in enumerate(zip(self.members, self._hyperparams, strict=True)):
             interval = item.target_update_interval
@@ -237,8 +247,12 @@ class DQNGroup:
                 member.target_updates_at = now
             member.num_target_updates += 1
             due.append(index)
-        if not due:
-            return
+        if due:
+            self._move_targets(due)
+
+    def _move_targets(self, due: Sequence[int]) -> None:
+        """Move the target networks of some members towards their online networks."""
+        assert self._targets is not None
         target, online = self._targets.networks.weights, self._networks.weights
         if len(due) == len(self.members):
             if self._copies:
