@@ -85,7 +85,13 @@ WORKS = {
         },
     ),
     "cartpole-dqn": Work(
-        "DQN on CartPole, tuned, 10 trials", "dqn", "CartPole-v1", 10, 20_000, "5 x", "cartpole-dqn-tuned"
+        "DQN on CartPole, tuned, 10 trials", "dqn", "CartPole-v1", 10, 20_000, "5 x", "cartpole-dqn-tuned",
+        # Which the peer does not have.
+        changes={"double_q": False},
+    ),
+    "cartpole-dqn-double": Work(
+        "DQN on CartPole, tuned, ours with double Q-learning", "dqn", "CartPole-v1", 10, 20_000, "",
+        "cartpole-dqn-tuned",
     ),
 }  # fmt: skip
 

@@ -5,7 +5,6 @@ Shapes: M members, N sub-environments per member, B rows per batch, D numbers pe
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
