@@ -159,7 +159,7 @@ class StackedNetworks:
 class _Dense:
     """A dense layer of some networks, whose weights are views, (K, inputs + 1, outputs), the biases last.
 
-    What is the same at each call is found once: a view of a tensor takes as long as a small layer's product.
+    What is the same at each call is found once: each view of a tensor takes microseconds, and an update needs dozens.
     """
 
     def __init__(self, layer: Tensor) -> None:

@@ -1,6 +1,7 @@
 """Members of a pack whose DQN networks are computed together: acting, and the updates of a training phase.
 
-Shapes: M members, N sub-environments per member, B rows per batch, D numbers per observation, A actions.
+Shapes: M members, N sub-environments per member, B rows per batch, U batches that are drawn at once, D
+numbers per observation, A actions.
 """
 
 from __future__ import annotations
@@ -233,7 +234,7 @@ class DQNGroup:
         if self._moves_always:
             for member in self.members:
                 member.num_target_updates += 1
-            self._move_targets(list(range(len(self.members))))
+            self._move_targets(range(len(self.members)))
             return
         due = []
         for index, (member, item) in enumerate(zip(self.members, self._hyperparams, strict=True)):

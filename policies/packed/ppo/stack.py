@@ -154,8 +154,9 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         envs.begin(num_steps)
         bounds = np.cumsum([0, *(len(group.members) for group in self._groups)]).tolist()
         # Where a GPU is, bytes are prepared by what acts, so that they may go there as such.
+        takes_bytes = self._has_gpu and self._seen.is_bytes
         prepares = [
-            self._observations.part(start, stop).prepare_bytes if self._has_gpu and self._seen.is_bytes else None
+            self._observations.part(start, stop).prepare_bytes if takes_bytes else None
             for start, stop in itertools.pairwise(bounds)
         ]
         outputs = fragment.outputs.reshape(num_steps, num_members, num_envs, self._num_outputs)
@@ -163,7 +164,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         for step in range(num_steps):
             observations = fragment.observations[step]
             observations[:] = envs.observations.reshape(observations.shape)
-            if prepares[0]:
+            if takes_bytes:
                 seen = observations.reshape(num_members, num_envs, -1)
             else:
                 seen = self._observations.prepare(observations)
