@@ -17,7 +17,7 @@ from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import ActionSpace, NetworkPolicy, Policy, action_function
 from policies.envs.checked import is_sound
 from policies.errors import TuneJobsError
-from policies.packed.envs.cartpole import CartPoleRows
+from policies.packed.envs.cartpole_rows import CartPoleRows
 from policies.portable.forward import ForwardPass, ForwardPasses
 
 _MAX_ROWS = 4096

@@ -12,7 +12,10 @@ from test_packed_envs import Actor, N, assert_equal_bits, make, own_modules, see
 
 from policies.envs.make import make_env
 from policies.errors import EnvError
+from policies.packed.envs import cartpole_rows
+from policies.packed.envs.cartpole_rows import CartPoleRows
 from policies.packed.envs.make import make_packed_envs
+from tests.narrowing import present
 
 __all__ = ["make", "own_modules"]
 
@@ -43,6 +46,73 @@ def test_vectorised_cartpole_takes_the_scalar_env_s_steps_to_the_last_bit(make: 
                 restart(row)
     assert num_ended["terminated"] > 10
     assert (num_ended["truncated"] > 10) is ("max_episode_steps" in env_args)
+
+
+@pytest.mark.parametrize("env_args", [{"max_episode_steps": 25}, {"sutton_barto_reward": True}])
+def test_cartpole_s_own_physics_steps_any_number_of_rows_as_gymnasium_s_to_the_last_bit(env_args: Any) -> None:
+    own = present(CartPoleRows.make("CartPole-v1", env_args))
+    theirs = CartPoleRows(cast("Any", own)._env, None)
+    assert own._physics is not None
+    rng = np.random.default_rng(3)
+    # From everywhere that an episode comes to, and beyond: far from 0 sines are computed in another way.
+    states = rng.normal(scale=[1.5, 2.0, 0.15, 2.0], size=(777, 4))
+    states[:50] *= 1e4
+    for num in (777, 64, 8, 5, 1, 0):
+        lengths = rng.integers(0, 25, num)
+        for rows in (own, theirs):
+            rows.put(states[:num], lengths)
+        for _ in range(3):
+            actions = rng.integers(0, 2, num)
+            found, expected = own.step(actions), theirs.step(actions)
+            for one, other in zip(
+                (*found, own.states, own.lengths), (*expected, theirs.states, theirs.lengths), strict=True
+            ):
+                assert (one.dtype, one.shape) == (other.dtype, other.shape)
+                assert one.tobytes() == other.tobytes()
+
+
+@pytest.mark.parametrize("changed", ["tau", "reward", "limit"])
+def test_a_version_of_gymnasium_that_steps_cartpole_otherwise_is_left_to_itself(
+    changed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = CartPoleVectorEnv.step
+
+    def other(env: Any, actions: Any) -> Any:
+        if changed == "tau":
+            before = env.tau
+            env.tau = 0.5 * before
+            try:
+                return step(env, actions)
+            finally:
+                env.tau = before
+        observations, rewards, terminated, truncated, info = step(env, actions)
+        return observations, rewards + (changed == "reward"), terminated, truncated | (changed == "limit"), info
+
+    monkeypatch.setattr(CartPoleVectorEnv, "step", other)
+    cartpole_rows._steps_alike.cache_clear()
+    try:
+        rows = present(CartPoleRows.make("CartPole-v1", None))
+        rows.put(np.full((2, 4), 0.01), np.zeros(2))
+        first, rewards, _, truncated, _ = rows.step(np.array([0, 1]))
+    finally:
+        cartpole_rows._steps_alike.cache_clear()
+    assert rows._physics is None
+    moved = 0.01 + (0.01 if changed == "tau" else 0.02) * 0.01
+    np.testing.assert_array_equal(first[:, 0], np.float32(moved))
+    np.testing.assert_array_equal(rewards, 2.0 if changed == "reward" else 1.0)
+    assert truncated.all() == (changed == "limit")
+
+
+def test_a_cartpole_with_other_numbers_is_stepped_with_these() -> None:
+    rows = present(CartPoleRows.make("CartPole-v1", None))
+    env = cast("Any", rows)._env
+    known = cartpole_rows.Numbers.of(env)
+    assert cartpole_rows._steps_alike(known._replace(length=0.7, force_mag=3.0, gravity=1.6))
+    # Its other method of integration is not here.
+    env.kinematics_integrator = "semi-implicit euler"
+    assert cartpole_rows.physics_of(env) is None
+    del env.polemass_length
+    assert cartpole_rows.physics_of(env) is None
 
 
 def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make: Any) -> None:

@@ -1,8 +1,8 @@
-"""Step CartPole for all members of a pack in one object: Gymnasium's own vectorised version with other resets.
+"""Step CartPole for all members of a pack in one object: the steps of Gymnasium's vectorised version, other resets.
 
 That version draws the start states of all sub-environments from one generator, and resets a sub-environment in the
 step after its episode's end. Here each member draws from a generator of its own, and where an episode has ended the
-next one's start state is set at once. The physics is Gymnasium's, to the last bit.
+next one's start state is set at once.
 """
 
 from __future__ import annotations
@@ -12,108 +12,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
 from numpy.typing import NDArray
 
 from policies import random_streams
-from policies.envs.make import make_env, make_vector_env
 from policies.errors import EnvError
+from policies.packed.envs.cartpole_rows import CartPoleRows
 from policies.packed.envs.penalty import Penalty
 from policies.packed.envs.rows import MemberRows, Rows
 from policies.packed.envs.vector import Step
-
-_Flags = NDArray[np.bool_]
-
-
-class CartPoleRows:
-    """Cart-poles whose number changes; they never reset by themselves.
-
-    Args:
-        env: Gives the physics and the time limit; it belongs to this object from here on.
-    """
-
-    def __init__(self, env: CartPoleVectorEnv) -> None:
-        self._env: Any = env
-        # The env's step checks that the actions are 0 or 1, for the number of sub-environments it was made with. Here
-        # that number changes, and the actions are a network's choices, which are always 0 or 1.
-        env.action_space = _AnyActions()
-        self.put(np.zeros((0, 4)), np.zeros(0, dtype=np.int32))
-
-    @classmethod
-    def make(cls, env_id: str, env_args: Mapping[str, Any] | None) -> CartPoleRows | None:
-        """Return cart-poles, or None if the env is not CartPole or has wrappers that its vectorised version lacks.
-
-        Raises:
-            EnvError: In the same cases as `policies.envs.make.make_env`.
-        """
-        scalar = make_env(env_id, env_args)
-        scalar.close()  # type: ignore[no-untyped-call]
-        if type(scalar.unwrapped) is not CartPoleEnv:
-            return None
-        env = make_vector_env(env_id, env_args, 1)
-        return cls(env) if type(env) is CartPoleVectorEnv else None  # with wrappers it is another class
-
-    @property
-    def observation_space(self) -> gym.Space[Any]:
-        """The observation space of one cart-pole."""
-        return self._env.single_observation_space  # type: ignore[no-any-return]
-
-    @property
-    def states(self) -> NDArray[np.float64]:
-        """The position, velocity, angle and angular velocity of each cart-pole, shape (num, 4)."""
-        return self._env.state.T  # type: ignore[no-any-return]
-
-    @property
-    def lengths(self) -> NDArray[np.int32]:
-        """The number of steps of each running episode, shape (num,)."""
-        return self._env.steps  # type: ignore[no-any-return]
-
-    def put(self, states: NDArray[np.float64], lengths: NDArray[Any]) -> None:
-        """Replace the cart-poles by others, in any number.
-
-        Args:
-            states: Their states, shape (num, 4).
-            lengths: The steps of their running episodes, shape (num,).
-        """
-        self._env.state = np.array(states.T, dtype=np.float64, order="C")
-        self._env.steps = np.array(lengths, dtype=np.int32)
-        self._no_resets = np.zeros(len(lengths), dtype=np.bool_)
-
-    def draw_starts(self, generator: np.random.Generator, *shape: int) -> NDArray[np.float64]:
-        """Draw start states, shape (*shape, 4)."""
-        return generator.uniform(self._env.low, self._env.high, (*shape, 4))
-
-    def restart(self, rows: Rows, states: NDArray[np.float64]) -> None:
-        """Begin new episodes at some rows from these states, shape (len(rows), 4)."""
-        self._env.state[:, rows] = states.T
-        self._env.steps[rows] = 0
-
-    def step(self, actions: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32], _Flags, _Flags, _Flags]:
-        """Step all cart-poles.
-
-        Returns:
-            Observations, shape (num, 4), rewards, terminated, truncated, and whether the episode has ended either way.
-        """
-        env = self._env
-        # Otherwise the env would reset the sub-environments whose episodes ended in the step before.
-        env.prev_done = self._no_resets
-        observations, rewards, terminated, truncated, _ = env.step(actions)
-        return np.ascontiguousarray(observations), rewards, terminated, truncated, env.prev_done
-
-    def close(self) -> None:
-        """Close the environment."""
-        self._env.close()
-
-
-class _AnyActions(gym.spaces.MultiDiscrete):
-    """An action space that accepts the actions of any number of cart-poles without a check."""
-
-    def __init__(self) -> None:
-        super().__init__([2])
-
-    def contains(self, x: Any) -> bool:
-        del x
-        return True
 
 
 class CartPoleEnvs:

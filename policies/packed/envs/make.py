@@ -99,7 +99,7 @@ def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
     Raises:
         EnvError: The environment cannot be made.
     """
-    from policies.packed.envs.cartpole import CartPoleRows
+    from policies.packed.envs.cartpole_rows import CartPoleRows
 
     env = make_env(env_id, env_args)
     may_have_rows = is_classic(env)

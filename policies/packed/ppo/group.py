@@ -203,7 +203,9 @@ class PPOGroup:
         if self._shares:
             outputs = self._networks.forward(observations)
             return self._allowed(outputs[..., : self._num_outputs], rows), outputs[..., -1]
-        outputs = self._networks.forward(observations.repeat(2, 1, 1))
+        # As `repeat` does, in less time.
+        twice = observations.expand(2, *observations.shape).reshape(-1, *observations.shape[1:]).contiguous()
+        outputs = self._networks.forward(twice)
         num_members = len(self.members)
         return self._allowed(outputs[:num_members], rows), outputs[num_members:, :, 0]
 
