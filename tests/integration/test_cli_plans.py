@@ -294,6 +294,23 @@ def test_version_and_help(run: RunCommand) -> None:
     assert "130 interrupted" in " ".join(run("--help").stdout.split())
 
 
+@pytest.mark.parametrize("arguments", [["--version"], ["launch", "nope", "--dry-run"]])
+def test_a_command_ends_without_looking_for_garbage_among_all_that_is_left(arguments: list[str]) -> None:
+    code = (
+        "import atexit, gc, sys\n"
+        "from tune_jobs.cli.commands import main\n"
+        "atexit.register(lambda: print(gc.get_freeze_count() > 1000, len(gc.get_objects()) < 1000))\n"
+        f"sys.argv = ['tune-jobs', *{arguments!r}]\n"
+        "main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.stdout.splitlines()[-1] == "True True"
+    assert done.returncode == (0 if arguments == ["--version"] else 2)
+
+
 def heavy_after(calls: Sequence[Sequence[str]], where: Path | None = None, **environment: str) -> tuple[str, list[str]]:
     """What a fresh process prints where these commands are called in it, and what of HEAVY it has loaded then."""
     code = (
