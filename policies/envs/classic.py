@@ -2,7 +2,7 @@
 
 Steps are those of Gymnasium's own environments to the last bit, at a tenth of their time and less. So each expression
 stands here as it does there, with the same types and in the same order; a power is the C library's, as NumPy's of one
-number is, where NumPy's of an array is a product. CartPole is not among them: Gymnasium has a vectorised one.
+number is, where NumPy's of an array is a product. CartPole is in `policies.packed.envs.cartpole_rows`.
 """
 
 from __future__ import annotations
