@@ -63,10 +63,9 @@ def test_cartpole_s_own_physics_steps_any_number_of_rows_as_gymnasium_s_to_the_l
             rows.put(states[:num], lengths)
         for _ in range(3):
             actions = rng.integers(0, 2, num)
-            found, expected = own.step(actions), theirs.step(actions)
-            for one, other in zip(
-                (*found, own.states, own.lengths), (*expected, theirs.states, theirs.lengths), strict=True
-            ):
+            found: list[Any] = [*own.step(actions), own.states, own.lengths]
+            expected: list[Any] = [*theirs.step(actions), theirs.states, theirs.lengths]
+            for one, other in zip(found, expected, strict=True):
                 assert (one.dtype, one.shape) == (other.dtype, other.shape)
                 assert one.tobytes() == other.tobytes()
 
@@ -103,16 +102,16 @@ def test_a_version_of_gymnasium_that_steps_cartpole_otherwise_is_left_to_itself(
     assert truncated.all() == (changed == "limit")
 
 
-def test_a_cartpole_with_other_numbers_is_stepped_with_these() -> None:
+def test_a_cartpole_with_other_constants_is_stepped_with_these() -> None:
     rows = present(CartPoleRows.make("CartPole-v1", None))
     env = cast("Any", rows)._env
-    known = cartpole_rows.Numbers.of(env)
+    known = cartpole_rows.Constants.of(env)
     assert cartpole_rows._steps_alike(known._replace(length=0.7, force_mag=3.0, gravity=1.6))
     # Its other method of integration is not here.
     env.kinematics_integrator = "semi-implicit euler"
-    assert cartpole_rows.physics_of(env) is None
+    assert cartpole_rows.own_physics(env) is None
     del env.polemass_length
-    assert cartpole_rows.physics_of(env) is None
+    assert cartpole_rows.own_physics(env) is None
 
 
 def test_start_states_are_those_of_cartpole_and_no_two_are_the_same(make: Any) -> None:

@@ -27,8 +27,8 @@ _COMPARED_LIMIT = 25
 """The time limit meanwhile, which the pole that is pushed to and fro comes to."""
 
 
-class Numbers(NamedTuple):
-    """The numbers of a cart-pole, by the names that they have in Gymnasium."""
+class Constants(NamedTuple):
+    """The constants of a cart-pole, by the names that they have in Gymnasium."""
 
     gravity: float
     masspole: float
@@ -43,7 +43,7 @@ class Numbers(NamedTuple):
     sutton_barto_reward: bool
 
     @classmethod
-    def of(cls, env: CartPoleVectorEnv) -> Numbers:
+    def of(cls, env: CartPoleVectorEnv) -> Constants:
         """Return those of an environment.
 
         Raises:
@@ -53,17 +53,17 @@ class Numbers(NamedTuple):
         return cls._make([*known, env._sutton_barto_reward])  # noqa: SLF001 (it is nowhere else)
 
 
-class Physics:
-    """The physics of any number of cart-poles, which knows its numbers and no state."""
+class CartPolePhysics:
+    """The physics of any number of cart-poles, which knows its constants and no state."""
 
-    def __init__(self, numbers: Numbers) -> None:
+    def __init__(self, constants: Constants) -> None:
         # As arrays without dimensions: a Python number becomes one in each call.
-        self._gravity, self._masspole, self._total_mass = map(np.array, numbers[:3])
-        self._length, self._polemass_length, _, self._tau = map(np.array, numbers[3:7])
-        self._forces = np.sign(np.array([0, 1]) - 0.5) * numbers.force_mag
-        self._limits = np.array([[numbers.x_threshold], [numbers.theta_threshold_radians]])
+        self._gravity, self._masspole, self._total_mass = map(np.array, constants[:3])
+        self._length, self._polemass_length, _, self._tau = map(np.array, constants[3:7])
+        self._forces = np.sign(np.array([0, 1]) - 0.5) * constants.force_mag
+        self._limits = np.array([[constants.x_threshold], [constants.theta_threshold_radians]])
         self._four_thirds = np.array(4.0 / 3.0)
-        self._is_sutton_barto = numbers.sutton_barto_reward
+        self._is_sutton_barto = constants.sutton_barto_reward
 
     def rewards(self, terminated: _Flags) -> NDArray[np.float32]:
         """Return the rewards of steps: 1, or with Sutton's and Barto's -1 for a fall and else nothing."""
@@ -117,7 +117,7 @@ class CartPoleRows:
         physics: Takes the steps; None: the environment does.
     """
 
-    def __init__(self, env: CartPoleVectorEnv, physics: Physics | None) -> None:
+    def __init__(self, env: CartPoleVectorEnv, physics: CartPolePhysics | None) -> None:
         self._env: Any = env
         # The env's step checks that the actions are 0 or 1, for the number of sub-environments it was made with. Here
         # that number changes, and the actions are a network's choices, which are always 0 or 1.
@@ -137,9 +137,8 @@ class CartPoleRows:
         if type(scalar.unwrapped) is not CartPoleEnv:
             return None
         env = make_vector_env(env_id, env_args, 1)
-        return (
-            cls(env, physics_of(env)) if type(env) is CartPoleVectorEnv else None
-        )  # with wrappers it is another class
+        # With wrappers it is another class.
+        return cls(env, own_physics(env)) if type(env) is CartPoleVectorEnv else None
 
     @property
     def observation_space(self) -> gym.Space[Any]:
@@ -205,27 +204,29 @@ class CartPoleRows:
         self._env.close()
 
 
-def physics_of(env: CartPoleVectorEnv) -> Physics | None:
+def own_physics(env: CartPoleVectorEnv) -> CartPolePhysics | None:
     """Return the physics of an environment, or None if steps would not be the environment's own to the last bit.
 
     What fails, as with a class that has other parts, is left to the environment.
     """
     try:
-        numbers = Numbers.of(env)
-        return Physics(numbers) if _steps_alike(numbers) else None
+        constants = Constants.of(env)
+        return CartPolePhysics(constants) if _steps_alike(constants) else None
     except Exception:  # noqa: BLE001 (another version may raise anything)
         return None
 
 
 @cache
-def _steps_alike(numbers: Numbers) -> bool:
-    """Whether rows with these numbers take the steps of Gymnasium's: one pushed to and fro, one left, one right."""
-    env: Any = CartPoleVectorEnv(3, max_episode_steps=_COMPARED_LIMIT, sutton_barto_reward=numbers.sutton_barto_reward)
-    for name in Numbers._fields[:-1]:
-        setattr(env, name, getattr(numbers, name))
+def _steps_alike(constants: Constants) -> bool:
+    """Whether rows with these constants take the steps of Gymnasium's: one pushed to and fro, one left, one right."""
+    env: Any = CartPoleVectorEnv(
+        3, max_episode_steps=_COMPARED_LIMIT, sutton_barto_reward=constants.sutton_barto_reward
+    )
+    for name in Constants._fields[:-1]:
+        setattr(env, name, getattr(constants, name))
     env.reset(seed=0)
     begin = env.state.T
-    both = CartPoleRows(env, None), CartPoleRows(env, Physics(numbers))
+    both = CartPoleRows(env, None), CartPoleRows(env, CartPolePhysics(constants))
     for rows in both:
         rows.put(begin, np.zeros(len(begin)))
     for number in range(_COMPARED_STEPS):
