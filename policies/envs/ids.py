@@ -13,7 +13,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, find_highest_version, get_env_id, parse_env_id
 
 from policies.envs.atari import INSTALL, is_atari_id
-from policies.envs.modules import import_module_allowed
+from policies.envs.modules import allowed_modules, import_module_allowed
 from policies.envs.plugins import load_env_plugins
 from policies.errors import EnvError, SpecError
 from policies.suggestions import did_you_mean
@@ -60,6 +60,10 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         reasons = "".join(f" {problem}" for problem in problems)
         guess = _nearest_ids(env_id, gym.registry)
         hint = "Correct the id, or install the package that registers it."
+        own = allowed_modules()
+        if own or not guess:
+            module = own[0] if own else "my_envs"
+            hint += f" What a module of your own registers is written module:id, as in {module}:Maze-v0."
         module, _, name = env_id.rpartition(".")
         if not guess and module and all(map(str.isidentifier, env_id.split("."))):
             guess = f" A class of a module is written module:Class: '{module}:{name}'."

@@ -108,6 +108,23 @@ def test_a_dot_in_the_place_of_the_colon_is_answered(env_id: str, meant: str | N
     assert "module:Class" not in caught.value.message.replace(told, "")
 
 
+@pytest.mark.parametrize(
+    ("env_id", "allowed", "told"),
+    [
+        ("Quarry-v0", ["test_shops"], "test_shops:Maze-v0"), ("Pendulm-v1", ["test_shops"], "test_shops:Maze-v0"),
+        ("Xqzw-v0", [], "my_envs:Maze-v0"), ("Pendulm-v1", [], None),
+    ],
+)  # fmt: skip
+def test_an_unknown_id_says_how_one_of_a_module_is_written(
+    env_id: str, allowed: list[str], told: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(env_modules, "_allowed", set(allowed))
+    with pytest.raises(EnvError, match="is registered with Gymnasium") as caught:
+        check_env(env_id, None, None)
+    assert ("module:id" in caught.value.hint) is (told is not None)
+    assert told is None or told in caught.value.hint
+
+
 @pytest.mark.parametrize("env_id", ["", "  ", None, 3, "a b c", "Nothing-v", "-v1", "x/y/z-v0"])
 def test_what_is_no_id_is_refused(env_id: int | str | None) -> None:
     with pytest.raises(EnvError):
