@@ -39,7 +39,7 @@ def grid(**values: Any) -> dict[str, dict[str, list[bool | float | str]]]:
             {"search": {"num_startup_trials": 3}},
             ["search.num_startup_trials can't act: search.type is random, not gp or forest or tpe."],
         ),
-        ({"scheduler": {"type": "asha", "reduction_factor": 4, "grace_env_steps": 100}}, []),
+        ({"scheduler": {"type": "asha", "reduction_factor": 4, "grace_env_steps": 25_000}}, []),
         ({"scheduler": {"type": "asha", "quantile_fraction": 0.25}}, []),
     ],
 )

@@ -22,6 +22,7 @@ from policies.errors import MALFORMED, CannotRunError, SpecError, said_by
 from policies.guard.guard import guarding
 from policies.guard.guarded import check_env
 from policies.hyperparams import Hyperparams
+from tune_jobs.plan.comparison_notes import comparison_notes
 from tune_jobs.plan.concurrency import max_concurrent
 from tune_jobs.plan.engine_choice import PackPlan, choose_engines, pack_key
 from tune_jobs.plan.env_checks import check_env_args, check_env_rules
@@ -224,6 +225,7 @@ def make_plan(
         notes=(
             *_notes(spec, env, concurrent if packs is None else None),
             *idle_settings(spec),
+            *comparison_notes(spec, ((own, each) for own, values in zip(specs, sizes, strict=True) for each in values)),
             *idle,
             *engine_notes,
             *memory_notes,
