@@ -91,6 +91,23 @@ def test_a_plan_says_which_points_a_model_will_choose() -> None:
     assert [line.count("by gp") for line in rows] == [0, 0, len(SPACE)]
 
 
+def test_a_plan_has_a_column_of_what_a_model_alone_may_choose() -> None:
+    search = {"type": "gp", "num_startup_trials": 2}
+    fields = {**MINIMAL, "algorithm": "dqn", "space": SPACE, "num_samples": 3, "search": search}
+    specs = [load_spec({**fields, "seed": seed}) for seed in range(20)]
+    plans = [(spec, make_plan(spec, Machine(2))) for spec in specs]
+    spec, plan = next(
+        each for each in plans if all(trial.point.get("replay") != "prioritized" for trial in each[1].trials)
+    )
+    console = Console(file=io.StringIO(), width=200)
+    console.print(_plan_table(spec, plan))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    (header,) = (line.split() for line in text.splitlines() if "replay" in line)
+    assert header == ["trial", "seed", *SPACE]
+    (chosen,) = (line for line in text.splitlines() if " t0002" in line)
+    assert chosen.count("by gp") == len(SPACE)
+
+
 def test_files_have_empty_cells_and_whole_numbers_stay_whole(data: SweepData) -> None:
     for rows in ("trials", "settings"):
         text = csv_text(make_frame(data, rows))

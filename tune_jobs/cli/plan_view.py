@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from analysis.points import searched_names, value_text
 from analysis.records import TRAINING_LENGTH
@@ -154,7 +155,11 @@ def _disk_bytes(plan: SweepPlan, race: Race | None) -> int:
 
 
 def _plan_table(spec: SweepSpec, plan: SweepPlan) -> Table:
-    names = searched_names(trial.point for trial in plan.trials)
+    points: list[Mapping[str, Any]] = [trial.point for trial in plan.trials]
+    if not all(points):
+        # What acts in none of the known points may act in one that the model chooses.
+        points.append(spec.space)
+    names = searched_names(points)
     engines_differ = len(plan.engines) > 1
     every = _selects_every(spec)
     more = [*(["engine"] if engines_differ else []), *(["selects every"] if len(every) > 1 else [])]
