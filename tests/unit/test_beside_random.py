@@ -20,6 +20,8 @@ from tests.narrowing import present
 from tune_jobs.cli import output
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import conclude
+from tune_jobs.sweeps import verbs as sweeps
+from tune_jobs.sweeps.attach import attach
 from tune_jobs.sweeps.confirm import are_all_alike, points_to_confirm
 from tune_jobs.sweeps.finishing import finish_sweep
 from tune_jobs.sweeps.outcome import SweepResult
@@ -112,6 +114,17 @@ def test_a_finished_sweep_notes_it_unless_it_is_a_baseline(tmp_path: Path, monke
     record = store.read_record()
     store.write_record(record.model_copy(update={"spec": record.spec | {"algorithm": "random"}}))
     assert finished(store, monkeypatch, lost) == ()
+
+
+def test_who_looks_on_is_told_too(tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "mine")
+    sweeps.best(store.folder, num_episodes=2)
+    best, better = store.read_best(), best_of((190.0, 200.0, 210.0), (20.0, 30.0, 10.0))
+    for confirmation, random in ((best.random, best.random), (better.confirmation, better.random)):
+        store.write_best(best.model_copy(update={"confirmation": confirmation, "random": random}))
+        told = nothing_learned(store.read_best())
+        assert bool(told) == (confirmation == random)
+        assert attach(store.folder, progress="none").notes == ((told,) if told else ())
 
 
 def line(evaluated: float | None, *trained: float) -> IterationRecord:

@@ -21,7 +21,7 @@ from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
 from tune_jobs.sweeps.monitor import SweepMonitor
-from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
 
 _POLL_S = 0.5
 _ASK_EVERY_S = 5.0
@@ -201,6 +201,7 @@ def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
         why_no_best=why if is_whole and best is None else None,
         artifacts=artifacts,
         interrupted=not is_whole,
+        notes=notes_on_best(record, best),
         # Who leaves out what follows the trials has no report of them either.
         finish_failed=failed or (is_whole and best is None and page is not None),
     )

@@ -7,15 +7,12 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
-from analysis.answers import nothing_learned
 from analysis.best_records import BestRecord
-from analysis.records import SweepRecord
-from analysis.report_data import is_trained
 from policies.errors import EnvFailedError, TuneJobsError
 from tune_jobs.process.interruption import current
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.drive import noted
-from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
 
 
 def finish_sweep(store: Sweep, result: SweepResult, progress: str = "none", *, keep: bool = False) -> SweepResult:
@@ -37,17 +34,9 @@ def finish_sweep(store: Sweep, result: SweepResult, progress: str = "none", *, k
         why_no_best=made.why_no_best,
         finish_failed=made.failed,
         artifacts=made.artifacts,
-        notes=(*_beside_random(result.sweep, made.best), *made.notes),
+        notes=(*notes_on_best(result.sweep, made.best), *made.notes),
         interrupted=made.stopped or current().came,
     )
-
-
-def _beside_random(sweep: SweepRecord, best: BestRecord | None) -> tuple[str, ...]:
-    """Return a note where training has not led beyond random play: all else is said in the tone of a result."""
-    if best is None or not is_trained(sweep):
-        return ()
-    told = nothing_learned(best)
-    return (told,) if told else ()
 
 
 class _Finish:

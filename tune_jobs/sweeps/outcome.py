@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from analysis.answers import nothing_learned
 from analysis.best_records import BestRecord
 from analysis.notebook import brief_repr, facts_html
 from analysis.records import SweepRecord, SweepState, TrialRecord, TrialStatus
+from analysis.report_data import is_trained
 from analysis.wording import counted, return_text
 from tune_jobs.sweeps.storage import folder_at, shown_place
 
@@ -86,3 +88,11 @@ class SweepResult:
         state = "interrupted" if self.interrupted else self.sweep.state
         best = "" if self.best is None else self.best._repr_html_()
         return facts_html(f"Sweep {self.sweep.name}: {state}", facts) + best
+
+
+def notes_on_best(sweep: SweepRecord, best: BestRecord | None) -> tuple[str, ...]:
+    """Return a note where training has not led beyond random play: all else is said in the tone of a result."""
+    if best is None or not is_trained(sweep):
+        return ()
+    told = nothing_learned(best)
+    return (told,) if told else ()
