@@ -26,7 +26,7 @@ from tests.rounding import assert_rounded, close
 if TYPE_CHECKING:
     from policies.packed.ppo.loss import Minibatch
 
-M, B = 4, 200
+M, B = 4, 208
 
 
 def column(*values: float) -> torch.Tensor:

@@ -17,6 +17,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from policies.packed.ppo.softmax import log_softmax, softmax, sum_of_values
+
 LOG_STD_CLIP = 20.0  # RLlib's value, as in policies.networks.rl_modules
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
@@ -36,14 +38,14 @@ class Heads:
     def log_softmax(self, outputs: Tensor) -> Tensor:
         """Return the log probability of each value of each choice, (..., A)."""
         if len(self.sizes) == 1:
-            return torch.log_softmax(outputs, dim=-1)
-        return torch.cat([torch.log_softmax(logits, dim=-1) for logits in self._each(outputs)], dim=-1)
+            return log_softmax(outputs)
+        return torch.cat([log_softmax(logits) for logits in self._each(outputs)], dim=-1)
 
     def entropies(self, probabilities: Tensor, logp: Tensor) -> Tensor:
         """Return the entropy of each value's choice, (..., A), or (..., 1) if there is one choice."""
         products = probabilities * logp
         if len(self.sizes) == 1:
-            return -products.sum(dim=-1, keepdim=True)
+            return -sum_of_values(products).unsqueeze(-1)
         return torch.cat([-part.sum(dim=-1, keepdim=True).expand_as(part) for part in self._each(products)], dim=-1)
 
     def _each(self, values: Tensor) -> tuple[Tensor, ...]:
@@ -143,7 +145,7 @@ def _choices_gradient(outputs: Tensor, batch: Minibatch, coefficients: Coefficie
         scale = (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
         out += (logp_all + entropy).mul_(probabilities).mul_(scale)
     if batch.old_outputs is not None:
-        old = heads.log_softmax(batch.old_outputs).exp() if len(heads.sizes) > 1 else batch.old_outputs.softmax(dim=-1)
+        old = heads.log_softmax(batch.old_outputs).exp() if len(heads.sizes) > 1 else softmax(batch.old_outputs)
         out += (probabilities - old).mul_((coefficients.kl_coeff / num_rows).unsqueeze(-1))
     return out
 
@@ -232,7 +234,7 @@ def _logp_and_entropy(outputs: Tensor, actions: Tensor, *, heads: Heads) -> tupl
     """Return the log probability of the actions and the entropy of the policy, (M, B) each."""
     if not heads.is_gaussian:
         logp_all = heads.log_softmax(outputs)
-        return (logp_all * actions).sum(dim=-1), -(logp_all.exp() * logp_all).sum(dim=-1)
+        return (logp_all * actions).sum(dim=-1), -sum_of_values(logp_all.exp() * logp_all)
     mean, log_std = _split(outputs)
     rows = -0.5 * ((actions - mean) / log_std.exp()) ** 2 - log_std - _HALF_LOG_TWO_PI
     return rows.sum(dim=-1), (log_std + 0.5 + _HALF_LOG_TWO_PI).sum(dim=-1)
@@ -247,7 +249,7 @@ def _kl(old: Tensor, new: Tensor, *, heads: Heads) -> Tensor:
     """Return the KL divergence of the present policy from the one that drew the actions, (M, B)."""
     if not heads.is_gaussian:
         old_logp = heads.log_softmax(old)
-        return (old_logp.exp() * (old_logp - heads.log_softmax(new))).sum(dim=-1)
+        return sum_of_values(old_logp.exp() * (old_logp - heads.log_softmax(new)))
     old_mean, old_log_std = _split(old)
     mean, log_std = _split(new)
     squares = torch.exp(2 * old_log_std) + (old_mean - mean) ** 2
