@@ -63,6 +63,7 @@ def test_rare_evaluations_are_told(scheduler: Any, every: int, wanted: str, made
     [
         ("none", 60), ("asha", 3), ("asha", 10), ({"type": "asha", "grace_env_steps": 10_000}, 10), ("hyperband", 10),
         ("median", 30), ("pbt", 6), ("pbt", 10), ({"type": "pbt", "perturb_every_env_steps": 30_000}, 20),
+        ({"type": "asha", "reduction_factor": 1e308}, 10),
     ],
 )  # fmt: skip
 def test_evaluations_that_are_close_enough_are_not_mentioned(scheduler: Any, every: int) -> None:

@@ -93,7 +93,7 @@ def _rungs(spec: SweepSpec, end: int) -> Iterator[int]:
         yield from (grace,) if grace < end else ()
         return
     for number in range(_MOST_RUNGS):
-        rung = math.ceil(grace * spec.scheduler.reduction_factor**number)
-        if rung >= end:
+        rung = grace * spec.scheduler.reduction_factor**number
+        if rung >= end:  # it may be infinite
             return
-        yield rung
+        yield math.ceil(rung)
