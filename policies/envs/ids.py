@@ -62,8 +62,8 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         hint = "Correct the id, or install the package that registers it."
         own = allowed_modules()
         if own or not guess:
-            module = own[0] if own else "my_envs"
-            hint += f" What a module of your own registers is written module:id, as in {module}:Maze-v0."
+            example = own[0] if own else "my_envs"
+            hint += f" What a module of your own registers is written module:id, as in {example}:Maze-v0."
         module, _, name = env_id.rpartition(".")
         if not guess and module and all(map(str.isidentifier, env_id.split("."))):
             guess = f" A class of a module is written module:Class: '{module}:{name}'."
