@@ -17,7 +17,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from policies.packed.ppo.softmax import log_softmax, softmax, sum_of_values
+from policies.packed.ppo.softmax import log_softmax, sum_of_values
 
 LOG_STD_CLIP = 20.0  # RLlib's value, as in policies.networks.rl_modules
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -145,7 +145,7 @@ def _choices_gradient(outputs: Tensor, batch: Minibatch, coefficients: Coefficie
         scale = (coefficients.entropy_coeff / num_rows).unsqueeze(-1)
         out += (logp_all + entropy).mul_(probabilities).mul_(scale)
     if batch.old_outputs is not None:
-        old = heads.log_softmax(batch.old_outputs).exp() if len(heads.sizes) > 1 else softmax(batch.old_outputs)
+        old = heads.log_softmax(batch.old_outputs).exp()
         out += (probabilities - old).mul_((coefficients.kl_coeff / num_rows).unsqueeze(-1))
     return out
 
