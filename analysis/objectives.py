@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.records import IterationRecord, Objective, TrialRecord, length_of
+from analysis.records import IterationRecord, Objective, TrialRecord, TrialState, length_of
 from analysis.statistics import area_under_curve, moderated_means
 from analysis.statistics.estimate import exponent_of
 
@@ -118,7 +118,7 @@ def rank_settings(
     return sorted(settings, key=order)
 
 
-def reached_goal(trial: TrialRecord) -> bool:
+def reached_goal(trial: TrialState) -> bool:
     """Whether a trial ended because it reached the return that its sweep stops at."""
     return (trial.stop_reason or "").startswith(_GOALS)
 
@@ -164,6 +164,29 @@ def score_of(
     """
     if objective != "steps_to_threshold":
         num_env_steps = length_of(trial.point, num_env_steps)
+    return score_so_far(trial, iterations, objective, num_env_steps=num_env_steps, threshold=threshold)
+
+
+def score_so_far(
+    trial: TrialState,
+    iterations: Sequence[IterationRecord],
+    objective: Objective,
+    *,
+    num_env_steps: int,
+    threshold: float | None = None,
+) -> float | None:
+    """Return what a trial scored if it ended where it stands; the arguments are those of `score_of`.
+
+    Args:
+        trial: Where it stands.
+        iterations: Its iterations, oldest first.
+        objective: What it is judged by.
+        num_env_steps: The env steps that it is to have itself; for `steps_to_threshold` those of the sweep.
+        threshold: The return to reach, for `steps_to_threshold`.
+
+    Raises:
+        ValueError: `steps_to_threshold` without a threshold.
+    """
     ended_itself = trial.status == "completed" and trial.stop_reason is not None and not reached_goal(trial)
     # What never reached the threshold counts as the same number of env steps, however long it tried.
     if ended_itself and trial.num_env_steps and objective != "steps_to_threshold":

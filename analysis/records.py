@@ -171,6 +171,10 @@ class TrialState(Record):
     evaluation_return: float | None = Field(None, description="The newest evaluation.")
     best_evaluation_return: float | None = None
     best_iteration: int | None = None
+    objective_score: float | None = Field(
+        None,
+        description="What it scores by the sweep's objective, if it ended here; where a search method learns of it.",
+    )
     notes: tuple[str, ...] = Field((), description="What was damaged in it, and what it continued from instead.")
     node: str | None = Field(None, description="Address or name of the node it last ran on.")
     pid: int | None = Field(None, description="Process it last ran in.")
@@ -182,7 +186,7 @@ class TrialState(Record):
     ended_at: float | None = None
     checkpoints: tuple[CheckpointRecord, ...] = Field((), description="The kept ones, oldest first.")
 
-    @field_validator("training_return", "evaluation_return", "best_evaluation_return")
+    @field_validator("training_return", "evaluation_return", "best_evaluation_return", "objective_score")
     @classmethod
     def _finite(cls, value: float | None) -> float | None:
         return finite_or_none(value)

@@ -44,9 +44,9 @@ def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     seen: list[int] = []
     known = history._known
 
-    def noting(spec: SweepSpec, members: Any) -> KnownPoint | None:
+    def noting(spec: SweepSpec, members: Any, score: Any) -> KnownPoint | None:
         seen.append(members[0].point_index)
-        return known(spec, members)
+        return known(spec, members, score)
 
     monkeypatch.setattr(history, "_known", noting)
     return seen

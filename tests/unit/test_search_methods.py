@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from analysis.records import TrialRecord
-from analysis.selection import score_trial
 from policies.errors import CannotRunError, SpecError
-from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
-from tune_jobs.search.history import known_points
+from tune_jobs.search.history import History, known_points
 from tune_jobs.search.proposal import propose_point
 from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
@@ -319,11 +317,30 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.Monkey
     make_plan(make_spec(search={"type": "auto"}), Machine(num_cpus=2))
 
 
-def test_the_model_learns_from_the_score_that_the_selection_goes_by() -> None:
+def test_the_model_learns_from_the_score_by_which_settings_are_judged() -> None:
     spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
-    one = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0})
-    (known,) = known_points(spec, [one])
-    assert known.score == present(score_trial(one)).score == 3.0
+    ended = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0, "objective_score": 2.0})
+    failed = record(1, point, 3.0, status="failed").model_copy(update={"objective_score": 2.0})
+    without = record(2, point, 3.0, status="stopped").model_copy(update={"objective_score": -1.0, "checkpoints": ()})
+    first, second, third = known_points(spec, [ended, failed, without])
+    assert (first.scores, second.scores, third.scores) == ((2.0,), (None,), (-1.0,))
+
+
+def test_a_sweep_of_a_former_version_goes_on_with_the_best_evaluations() -> None:
+    """Its trials have no score by the objective; those that end from now on have one, which is another number."""
+    spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
+    told, former = History(spec), record(0, point, 3.0)
+    assert [item.score for item in told.known_points([former])] == [3.0]
+    newer = record(1, point, 4.0).model_copy(update={"objective_score": 1.0})
+    assert [item.score for item in told.known_points([former, newer])] == [3.0, 4.0]
+    assert [item.score for item in known_points(spec, [newer])] == [1.0]
+
+
+def test_what_ends_without_a_threshold_that_anybody_knows_counts_by_its_best_evaluation() -> None:
+    spec, point = make_spec(objective={"type": "steps_to_threshold"}), {"lr": 1e-3, "activation": "tanh"}
+    told = History(spec)
+    assert told.known_points([]) == []
+    assert [item.score for item in told.known_points([record(0, point, 3.0)])] == [3.0]
 
 
 def test_of_what_has_not_begun_a_model_is_told_nothing() -> None:

@@ -45,7 +45,10 @@ def test_the_file_of_a_trial_is_as_it_was_before_its_record_was_made_of_parts() 
         pid=12, ran_with={"cpu": "a CPU"}, started_at=1_700_000_000.25, ended_at=1_700_000_001.0,
         checkpoints=(CHECKPOINT,),
     )  # fmt: skip
-    assert dump(record) == SAMPLE.read_text(encoding="utf-8")
+    # What records have got since.
+    newer = ' "objective_score": null,\n'
+    assert dump(record).count(newer) == 1
+    assert dump(record).replace(newer, "") == SAMPLE.read_text(encoding="utf-8")
     assert TrialRecord.model_validate_json(SAMPLE.read_bytes()) == record
 
 

@@ -43,6 +43,7 @@ from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.progress import Progress
 from tune_jobs.training.protocol import TrainingEngine, TrialTask
 from tune_jobs.training.registry import make_engine
+from tune_jobs.training.scoring import judging_of
 from tune_jobs.training.trial_loop import TrialLoop
 
 # Reporting every iteration of a fast env would take longer than the iteration.
@@ -124,6 +125,7 @@ class TaskReader:
             rl_module=spec.rl_module,
             changes=trial.changes,
             in_step=spec.scheduler.waits_for_others and trial.seed_index < spec.seeds_per_point,
+            judging=judging_of(spec, self.sweep, trial.point),
             engine=engine_on_record(trial.engine, spec.algorithm).name,
         )
 

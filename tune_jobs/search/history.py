@@ -2,8 +2,9 @@
 
 A point is known to a method by its values, by what became of each of its seeds, and by how far it got:
 
-- ended: of each seed its best evaluation return, which the selection compares too; None for one that failed or was
-  never evaluated with a finite return, which counts as worse than all that was;
+- ended: of each seed what it scored by the sweep's objective, by which settings are judged, too (decision 29); None for
+  one that failed or showed nothing that can be scored, which counts as worse than all that did. Records of former
+  versions lack it: a sweep that has such trials goes on with the best evaluation return of each;
 - ended early by a scheduler: the same, and the rung that its first trial reached;
 - running: the scores of those seeds that have ended, which are not like the others: what is solved ends early;
 - planned, but not begun, or chosen by somebody with a value that the search could not give: nothing, as a model has no
@@ -16,7 +17,7 @@ import functools
 import math
 import operator
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +59,7 @@ class History:
 
     def __init__(self, spec: SweepSpec) -> None:
         self._spec = spec
+        self._by_objective: bool | None = None
         self._seen: dict[int, tuple[list[TrialRecord], KnownPoint | None]] = {}
         """By point, its trials as they were when it was looked at, and what they told."""
 
@@ -68,6 +70,9 @@ class History:
             records: The records of all trials of the sweep, in any order; those that have not changed may be the same
                 objects as before, which saves time.
         """
+        if self._by_objective is None:
+            # Decided once: scores of two kinds can't be compared.
+            self._by_objective = not any(map(_is_of_a_former_version, records))
         points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
         for record in records:
             if record.has_point:
@@ -80,7 +85,8 @@ class History:
         # Records are not changed, but replaced.
         if seen is not None and len(seen[0]) == len(members) and all(map(operator.is_, seen[0], members)):
             return seen[1]
-        found = _known(self._spec, sorted(members, key=lambda record: record.index))
+        score = _objective_score if self._by_objective else _best_evaluation
+        found = _known(self._spec, sorted(members, key=lambda record: record.index), score)
         self._seen[index] = members, found
         return found
 
@@ -95,28 +101,43 @@ def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownP
     return History(spec).known_points(records)
 
 
-def _known(spec: SweepSpec, members: Sequence[TrialRecord]) -> KnownPoint | None:
+def _known(
+    spec: SweepSpec, members: Sequence[TrialRecord], score: Callable[[TrialRecord], float | None]
+) -> KnownPoint | None:
     """Return what a model is told of a point; None: nothing.
 
     Args:
         spec: The sweep.
         members: The records of its trials that have a point, in their order.
+        score: Returns what one that has ended scored; None: nothing.
     """
     if outside(spec.space, members[0].point) or all(record.status == "pending" for record in members):
         return None
     ended = [record for record in members if record.status in FINISHED]
     return KnownPoint(
         point=members[0].point,
-        scores=tuple(map(_score, ended)),
+        scores=tuple(map(score, ended)),
         env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps) for record in ended),
         is_running=any(record.status not in FINISHED for record in members if record.seed_index < spec.seeds_per_point),
         level=_level(spec, members),
     )
 
 
-def _score(record: TrialRecord) -> float | None:
+def _objective_score(record: TrialRecord) -> float | None:
+    if record.status == "failed":
+        return None
+    # Nobody knows it where the threshold to reach is not known any more.
+    return _best_evaluation(record) if record.objective_score is None else record.objective_score
+
+
+def _best_evaluation(record: TrialRecord) -> float | None:
     scored = score_trial(record)
     return None if scored is None else scored.score
+
+
+def _is_of_a_former_version(record: TrialRecord) -> bool:
+    """Return whether a trial has ended with an evaluation, but without a score by the objective."""
+    return record.status in FINISHED and record.objective_score is None and score_trial(record) is not None
 
 
 def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from analysis.records import ChangeRecord
 from policies.portable.file import PortablePolicy
 from tune_jobs.spec.sections import CheckpointSpec, EvaluationSpec, StopSpec
+from tune_jobs.training.scoring import Judging
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,16 @@ class TrialTask:
     in_step: bool = False
     """Whether it waits for other trials at numbers of env steps; in a pack it then shares a stack with such members
     alone as are always as far as it is."""
+    judging: Judging | None = None
+    """How its score is told to a search method; None: to none."""
     engine: str = ""
     """The engine's name for the manifests of checkpoints; empty: they name none."""
+
+    @property
+    def learning_settings(self) -> str:
+        """The hyperparameters that bound the steps of weights, for a message."""
+        known = [name for name in ("lr", "lr_final", "grad_clip") if name in self.hyperparams]
+        return "".join(f", {name} {self.hyperparams[name]}" for name in known)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialStatus, finite_or_none
 from analysis.selection import best_checkpoint
@@ -33,6 +32,7 @@ from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.recovery import take_up_checkpoints, take_up_copy, take_up_results
 from tune_jobs.training.protocol import IterationStats, TrialEngine, TrialTask
+from tune_jobs.training.scoring import RunningScore
 from tune_jobs.training.stop_rules import stop_reason
 
 TRAINING_RETURN_EPISODES = 100
@@ -74,6 +74,7 @@ class TrialSteps:
         self._best: CheckpointRecord | None = None
         self._unwritten: list[IterationRecord] = []
         self._untold: list[IterationRecord] = []
+        self._score = RunningScore(task.judging)
         self._notes: list[str] = []
         # The iteration that is not concluded yet, and the stop rule that applies before its evaluation.
         self._taken = self._last
@@ -182,6 +183,7 @@ class TrialSteps:
         iteration = start.iteration if start is not None else 0
         changed_at = max((change.iteration for change in self.task.changes if change.iteration <= iteration), default=0)
         kept = [record for record in found.records if record.iteration <= iteration]
+        self._score.begin(kept)
         time_s = 0.0
         if self._store.has_results():
             self._store.keep_iterations(kept)
@@ -261,7 +263,7 @@ class TrialSteps:
         record, reason = self._taken, self._reason
         if isinstance(evaluation, NonFiniteWeightsError):
             # Later iterations would fail in the same way, and a retry too, so the trial is over.
-            text = f"{evaluation} (iteration {self._last.iteration + 1}{_learning_settings(self.task.hyperparams)})"
+            text = f"{evaluation} (iteration {self._last.iteration + 1}{self.task.learning_settings})"
             if record.iteration > self._last.iteration:  # otherwise the training raised the error
                 self._unwritten.append(record)
                 self._untold.append(record)
@@ -277,6 +279,7 @@ class TrialSteps:
         self._last = record.model_copy(update={"time_s": self._clock() - self._started})
         self._unwritten.append(self._last)
         self._untold.append(self._last)
+        self._score.add(self._last)
         self._tally.set(_reached(self._last))
         if evaluation is not None:
             self._evaluated_at = record.num_env_steps
@@ -369,7 +372,7 @@ class TrialSteps:
             self._store.settle()
             end_tally(self.task.trial_id)
             self._store.forget_tally()
-        return Progress(
+        progress = Progress(
             num_iterations=self._last.iteration,
             num_env_steps=self._last.num_env_steps,
             num_episodes=self._last.num_episodes,
@@ -388,12 +391,7 @@ class TrialSteps:
             started_at=self._started_at,
             ended_at=None if status == "running" else time.time(),
         )
-
-
-def _learning_settings(hyperparams: dict[str, Any]) -> str:
-    """Return the hyperparameters that bound the steps of weights, for a message."""
-    known = [name for name in ("lr", "lr_final", "grad_clip") if name in hyperparams]
-    return "".join(f", {name} {hyperparams[name]}" for name in known)
+        return self._score.told(progress)
 
 
 def _reached(record: IterationRecord) -> Reached:

@@ -1,0 +1,81 @@
+"""What a trial has scored by its sweep's objective, which its process tells where a search method learns of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.objectives import score_so_far
+from analysis.records import IterationRecord, Objective, SweepRecord, length_of
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.progress import Progress
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How a trial is judged; see `analysis.objectives.score_of`."""
+
+    objective: Objective
+    num_env_steps: int
+    """The env steps that the trial is to have; for `steps_to_threshold` those of the sweep."""
+    threshold: float | None = None
+    """The return to reach, for `steps_to_threshold`."""
+    at_evaluations: bool = False
+    """Whether a scheduler may end it after any evaluation; otherwise only its end is judged."""
+
+
+def judging_of(spec: SweepSpec, sweep: SweepRecord, point: Mapping[str, Any]) -> Judging | None:
+    """Return how a trial is judged; None: no search method learns of it, or nobody knows the threshold any more.
+
+    Args:
+        spec: The sweep.
+        sweep: Its record, which has the env's own threshold.
+        point: The trial's searched values, of which one may be how long it trains.
+    """
+    objective, all_steps = spec.objective.type, spec.stop.num_env_steps
+    threshold, num_env_steps = None, length_of(point, all_steps)
+    if objective == "steps_to_threshold":
+        threshold, num_env_steps = spec.objective.threshold, all_steps
+        threshold = sweep.env_threshold if threshold is None else threshold
+    if not spec.search.has_model or (objective == "steps_to_threshold" and threshold is None):
+        return None
+    return Judging(objective, num_env_steps, threshold, at_evaluations=spec.scheduler.type != "none")
+
+
+class RunningScore:
+    """Scores one trial while it trains.
+
+    Args:
+        judging: How; None: no score is told.
+    """
+
+    def __init__(self, judging: Judging | None) -> None:
+        self._judging = judging
+        self._iterations: list[IterationRecord] = []
+        self._score: float | None = None
+
+    def begin(self, iterations: Iterable[IterationRecord]) -> None:
+        """Begin with what there is of the trial."""
+        self._iterations, self._score = [], None
+        for record in iterations:
+            self.add(record)
+
+    def add(self, record: IterationRecord) -> None:
+        """Add an iteration, with its evaluation if it has one."""
+        if self._judging is not None:
+            # Losses and lengths say nothing of it, and thousands of these are kept.
+            self._iterations.append(record.model_copy(update={"learner": {}, "episode_lengths": ()}))
+
+    def told(self, progress: Progress) -> Progress:
+        """Return what the process tells, with the newest score."""
+        judging = self._judging
+        if judging is None:
+            return progress
+        is_over = progress.status in ("completed", "stopped")
+        if is_over or (judging.at_evaluations and progress.evaluated):
+            self._score = score_so_far(
+                progress, self._iterations, judging.objective, num_env_steps=judging.num_env_steps,
+                threshold=judging.threshold,
+            )  # fmt: skip
+        return progress.model_copy(update={"objective_score": self._score})
