@@ -173,7 +173,7 @@ class TrialState(Record):
     best_iteration: int | None = None
     objective_score: float | None = Field(
         None,
-        description="What it scores by the sweep's objective, if it ended here; where a search method learns of it.",
+        description="Its score by the sweep's objective, if it ended here; null: no search method learns of it.",
     )
     notes: tuple[str, ...] = Field((), description="What was damaged in it, and what it continued from instead.")
     node: str | None = Field(None, description="Address or name of the node it last ran on.")

@@ -121,10 +121,13 @@ def judging(point: Mapping[str, Any] | None = None, env_threshold: float | None 
 
 
 def test_it_is_by_the_sweeps_objective() -> None:
-    assert judging() == Judging("final", 50_000)
     assert judging(objective="area") == Judging("area", 50_000)
-    assert judging(search="random") is None
-    assert judging(scheduler="asha") == Judging("final", 50_000, at_evaluations=True)
+    assert judging(objective="best", scheduler="asha") == Judging("best", 50_000, at_evaluations=True)
+    assert judging(objective="area", search="random") is None
+
+
+def test_of_final_no_search_learns() -> None:
+    assert judging() is None
 
 
 def test_the_threshold_is_the_objectives_or_the_envs_own() -> None:
@@ -135,11 +138,11 @@ def test_the_threshold_is_the_objectives_or_the_envs_own() -> None:
 
 
 def test_a_searched_length_is_what_it_is_to_have_but_for_the_steps_to_a_threshold() -> None:
-    searched = {
+    searched: dict[str, Any] = {
         "space": {**BASE["space"], "stop.num_env_steps": {"choice": [20_000, 50_000]}}, "stop": {},
-        "objective": ["return", "env_steps"],
+        "objective": {"type": "area", "cost": "env_steps"},
     }  # fmt: skip
     point = {"lr": 1e-3, "stop.num_env_steps": 20_000}
-    assert judging(point, **searched) == Judging("final", 20_000)
+    assert judging(point, **searched) == Judging("area", 20_000)
     searched["objective"] = {"type": "steps_to_threshold"}
     assert judging(point, **searched) == Judging("steps_to_threshold", 50_000, 475.0)

@@ -2,9 +2,9 @@
 
 A point is known to a method by its values, by what became of each of its seeds, and by how far it got:
 
-- ended: of each seed what it scored by the sweep's objective, by which settings are judged, too (decision 29); None for
-  one that failed or showed nothing that can be scored, which counts as worse than all that did. Records of former
-  versions lack it: a sweep that has such trials goes on with the best evaluation return of each;
+- ended: of each seed what it scored by the sweep's objective, or its best evaluation return if that is `final`
+  (decision 53); None for one that failed or showed nothing that can be scored, which counts as worse than all that did.
+  Records of former versions lack a score: a sweep that has such trials goes on with the best evaluations;
 - ended early by a scheduler: the same, and the rung that its first trial reached;
 - running: the scores of those seeds that have ended, which are not like the others: what is solved ends early;
 - planned, but not begun, or chosen by somebody with a value that the search could not give: nothing, as a model has no
@@ -126,7 +126,7 @@ def _known(
 def _objective_score(record: TrialRecord) -> float | None:
     if record.status == "failed":
         return None
-    # Nobody knows it where the threshold to reach is not known any more.
+    # It has none if the objective is `final`, or if the threshold to reach is not known any more.
     return _best_evaluation(record) if record.objective_score is None else record.objective_score
 
 

@@ -1,4 +1,8 @@
-"""What a trial has scored by its sweep's objective, which its process tells where a search method learns of it."""
+"""What a trial has scored by its sweep's objective, which its process tells where a search method learns of it.
+
+None learns of `final`: there the best evaluation, which is in the record anyway, led to better settings on one of two
+tasks, and to worse ones on the other (decision 53).
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,9 @@ class Judging:
 
 
 def judging_of(spec: SweepSpec, sweep: SweepRecord, point: Mapping[str, Any]) -> Judging | None:
-    """Return how a trial is judged; None: no search method learns of it, or nobody knows the threshold any more.
+    """Return how a trial is judged, where a search method learns of it; None: none does.
+
+    None, too, where nobody knows the threshold any more.
 
     Args:
         spec: The sweep.
@@ -38,7 +44,7 @@ def judging_of(spec: SweepSpec, sweep: SweepRecord, point: Mapping[str, Any]) ->
     if objective == "steps_to_threshold":
         threshold, num_env_steps = spec.objective.threshold, all_steps
         threshold = sweep.env_threshold if threshold is None else threshold
-    if not spec.search.has_model or (objective == "steps_to_threshold" and threshold is None):
+    if not spec.search.has_model or objective == "final" or (objective == "steps_to_threshold" and threshold is None):
         return None
     return Judging(objective, num_env_steps, threshold, at_evaluations=spec.scheduler.type != "none")
 
