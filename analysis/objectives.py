@@ -175,7 +175,7 @@ def score_so_far(
     num_env_steps: int,
     threshold: float | None = None,
 ) -> float | None:
-    """Return what a trial scored if it ended where it stands; the arguments are those of `score_of`.
+    """Return what a trial scores if it ends where it stands; see `score_of`.
 
     Args:
         trial: Where it stands.

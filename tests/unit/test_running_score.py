@@ -122,12 +122,12 @@ def judging(point: Mapping[str, Any] | None = None, env_threshold: float | None 
 
 def test_it_is_by_the_sweeps_objective() -> None:
     assert judging(objective="area") == Judging("area", 50_000)
-    assert judging(objective="best", scheduler="asha") == Judging("best", 50_000, at_evaluations=True)
+    assert judging(objective="area", scheduler="asha") == Judging("area", 50_000, at_evaluations=True)
     assert judging(objective="area", search="random") is None
 
 
-def test_of_final_no_search_learns() -> None:
-    assert judging() is None
+def test_beside_final_and_best_a_search_learns_of_the_best_evaluation_alone() -> None:
+    assert judging() is judging(objective="final") is judging(objective="best") is None
 
 
 def test_the_threshold_is_the_objectives_or_the_envs_own() -> None:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from analysis.records import TrialRecord
+from analysis.selection import score_trial
 from policies.errors import CannotRunError, SpecError
+from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.search.history import History, known_points
@@ -317,13 +319,33 @@ def test_without_optuna_the_plan_says_what_to_install(monkeypatch: pytest.Monkey
     make_plan(make_spec(search={"type": "auto"}), Machine(num_cpus=2))
 
 
-def test_the_model_learns_from_the_score_by_which_settings_are_judged() -> None:
+def test_the_model_learns_from_the_score_that_the_selection_goes_by() -> None:
+    spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
+    one = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0})
+    (known,) = known_points(spec, [one])
+    assert known.score == present(score_trial(one)).score == 3.0
+
+
+def test_where_trials_tell_a_score_by_the_objective_the_model_learns_from_that() -> None:
     spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
     ended = record(0, point, 3.0).model_copy(update={"best_evaluation_return": 99.0, "objective_score": 2.0})
     failed = record(1, point, 3.0, status="failed").model_copy(update={"objective_score": 2.0})
     without = record(2, point, 3.0, status="stopped").model_copy(update={"objective_score": -1.0, "checkpoints": ()})
     first, second, third = known_points(spec, [ended, failed, without])
     assert (first.scores, second.scores, third.scores) == ((2.0,), (None,), (-1.0,))
+
+
+def test_where_others_tell_scores_one_that_tells_none_does_not_count_by_its_best_evaluation() -> None:
+    """A return of 3 would be better than all env steps to a threshold, which are less than 0."""
+    spec, point = make_spec(), {"lr": 1e-3, "activation": "tanh"}
+    told = History(spec)
+    # Never evaluated, and remembered before it is known what scores are.
+    first = record(0, point, math.nan).model_copy(update={"objective_score": -2_000.0, "checkpoints": ()})
+    told.known_points([first])
+    second = record(1, point, 9.0).model_copy(update={"objective_score": -500.0})
+    found = told.known_points([first, second])
+    assert [item.scores for item in found] == [(-2_000.0,), (-500.0,)]
+    assert [item.scores for item in told.known_points([first, second, record(2, point, 3.0)])][2] == (None,)
 
 
 def test_a_sweep_of_a_former_version_goes_on_with_the_best_evaluations() -> None:

@@ -2,9 +2,9 @@
 
 A point is known to a method by its values, by what became of each of its seeds, and by how far it got:
 
-- ended: of each seed what it scored by the sweep's objective, or its best evaluation return if that is `final`
-  (decision 53); None for one that failed or showed nothing that can be scored, which counts as worse than all that did.
-  Records of former versions lack a score: a sweep that has such trials goes on with the best evaluations;
+- ended: of each seed its score by the sweep's objective where its process told one (decision 53), else its best
+  evaluation return; None for one that failed or showed nothing that can be scored, which counts as worse than all that
+  did. A sweep begun by a former version, whose processes told none, goes on with the best evaluations;
 - ended early by a scheduler: the same, and the rung that its first trial reached;
 - running: the scores of those seeds that have ended, which are not like the others: what is solved ends early;
 - planned, but not begun, or chosen by somebody with a value that the search could not give: nothing, as a model has no
@@ -71,8 +71,10 @@ class History:
                 objects as before, which saves time.
         """
         if self._by_objective is None:
-            # Decided once: scores of two kinds can't be compared.
-            self._by_objective = not any(map(_is_of_a_former_version, records))
+            # Decided once, for all trials: scores of two kinds can't be compared.
+            self._by_objective = _tell_scores(records)
+            if self._by_objective:
+                self._seen.clear()  # until then the best evaluations were told
         points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
         for record in records:
             if record.has_point:
@@ -124,10 +126,7 @@ def _known(
 
 
 def _objective_score(record: TrialRecord) -> float | None:
-    if record.status == "failed":
-        return None
-    # It has none if the objective is `final`, or if the threshold to reach is not known any more.
-    return _best_evaluation(record) if record.objective_score is None else record.objective_score
+    return None if record.status == "failed" else record.objective_score
 
 
 def _best_evaluation(record: TrialRecord) -> float | None:
@@ -135,9 +134,10 @@ def _best_evaluation(record: TrialRecord) -> float | None:
     return None if scored is None else scored.score
 
 
-def _is_of_a_former_version(record: TrialRecord) -> bool:
-    """Return whether a trial has ended with an evaluation, but without a score by the objective."""
-    return record.status in FINISHED and record.objective_score is None and score_trial(record) is not None
+def _tell_scores(records: Sequence[TrialRecord]) -> bool | None:
+    """Return whether trials that ended with an evaluation have scores by the objective; None: none has ended so yet."""
+    ended = [record for record in records if record.status in FINISHED and score_trial(record) is not None]
+    return all(record.objective_score is not None for record in ended) if ended else None
 
 
 def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:

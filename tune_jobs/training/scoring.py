@@ -1,7 +1,7 @@
 """What a trial has scored by its sweep's objective, which its process tells where a search method learns of it.
 
-None learns of `final`: there the best evaluation, which is in the record anyway, led to better settings on one of two
-tasks, and to worse ones on the other (decision 53).
+Where it tells none, a search learns of the best evaluation, which is in the record anyway. `best` asks for just that;
+beside `final` it led to better settings on one of two tasks, and to worse ones on the other (decision 53).
 """
 
 from __future__ import annotations
@@ -30,23 +30,21 @@ class Judging:
 
 
 def judging_of(spec: SweepSpec, sweep: SweepRecord, point: Mapping[str, Any]) -> Judging | None:
-    """Return how a trial is judged, where a search method learns of it; None: none does.
-
-    None, too, where nobody knows the threshold any more.
+    """Return how a trial is judged where a search method learns its score; None: none does, or can.
 
     Args:
         spec: The sweep.
         sweep: Its record, which has the env's own threshold.
         point: The trial's searched values, of which one may be how long it trains.
     """
-    objective, all_steps = spec.objective.type, spec.stop.num_env_steps
-    threshold, num_env_steps = None, length_of(point, all_steps)
-    if objective == "steps_to_threshold":
-        threshold, num_env_steps = spec.objective.threshold, all_steps
-        threshold = sweep.env_threshold if threshold is None else threshold
-    if not spec.search.has_model or objective == "final" or (objective == "steps_to_threshold" and threshold is None):
-        return None
-    return Judging(objective, num_env_steps, threshold, at_evaluations=spec.scheduler.type != "none")
+    objective, all_steps, compares = spec.objective, spec.stop.num_env_steps, spec.scheduler.type != "none"
+    if spec.search.has_model and objective.type == "area":
+        return Judging("area", length_of(point, all_steps), at_evaluations=compares)
+    # A record of a former version may not know the env's own.
+    threshold = sweep.env_threshold if objective.threshold is None else objective.threshold
+    if spec.search.has_model and objective.type == "steps_to_threshold" and threshold is not None:
+        return Judging("steps_to_threshold", all_steps, threshold, at_evaluations=compares)
+    return None
 
 
 class RunningScore:
