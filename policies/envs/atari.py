@@ -128,6 +128,12 @@ def _no_game(env_id: str) -> EnvError:
     )
 
 
+def lives_of(game: gym.Env[Any, Any]) -> int:
+    """Return the lives that are left in a game, by the emulator itself: not all infos are kept."""
+    inner: Any = game.unwrapped
+    return int(inner.ale.lives())
+
+
 def is_of_emulator(entry_point: Any) -> bool:
     """Whether an entry of Gymnasium's registry is one of the emulator's own package."""
     module = entry_point if isinstance(entry_point, str) else getattr(entry_point, "__module__", "")
@@ -155,14 +161,13 @@ class AtariTraining(TrainingView):
     ) -> None:
         super().__init__(env)
         inner: Any = env.unwrapped
-        self._games: list[Any] = [game.unwrapped for game in inner.envs] if terminal_on_life_loss else []
+        self._games: list[Any] = list(inner.envs) if terminal_on_life_loss else []
         self._clip = clip_rewards
         self._lives = self._lives_now()
         self._ended = np.zeros(env.num_envs, np.bool_)
 
     def _lives_now(self) -> NDArray[np.int64]:
-        # From the emulator itself: infos are left out of vectors.
-        return np.array([game.ale.lives() for game in self._games], np.int64)
+        return np.array(list(map(lives_of, self._games)), np.int64)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset all games."""

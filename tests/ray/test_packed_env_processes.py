@@ -53,5 +53,7 @@ def test_one_trial_alone_has_its_slow_environment_stepped_by_the_idle_cpu(
     assert (record.status, record.error) == ("completed", None)
     stepped = [tuple(map(int, line.split())) for line in pids.read_text().splitlines()]
     in_processes = [pid for pid, parent in stepped if parent == record.pid]
-    assert len(in_processes) == NUM_ENVS
+    # The pack's own process has the other half.
+    assert len(in_processes) == NUM_ENVS // 2
     assert len(set(in_processes)) == 1
+    assert len([pid for pid, _ in stepped if pid == record.pid]) >= NUM_ENVS // 2

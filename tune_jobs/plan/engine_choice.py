@@ -208,6 +208,8 @@ class _Images:
         """Return why an engine is not chosen for a trial, or None if it is; None for a point that is not known."""
         if self._spec.engine == engine.name or "large_images" not in engine.lacks or not self._env.observes_images:
             return None
+        if self._spec.resources.num_gpus:
+            return None
         if hyperparams is None and not self._largest and self._known:
             self._largest = largest_hyperparams(self._spec, self._known)
         shape = tuple(self._env.observation_space.shape or ())

@@ -16,11 +16,11 @@ from typing import Literal
 from policies.errors import CheckpointError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, RandomHyperparams
 
-Need = Literal["rl_module", "convolutions", "large_images", "atari", "env_runners", "copies", "pauses", "unseeded"]
+Need = Literal["rl_module", "convolutions", "large_images", "env_runners", "copies", "pauses", "unseeded"]
 """What a sweep or a trial may need from its engine: an RLModule of the user's own; convolutions; those of large images,
-where the engine isn't asked for; what training alone sees of an Atari game; env runners in processes of their own; to
-continue from copies of other trials' checkpoints; to be paused until others have reached the same env steps; an
-environment whose episodes don't follow from its seeds."""
+without a GPU and where the engine isn't asked for; env runners in processes of their own; to continue from copies of
+other trials' checkpoints; to be paused until others have reached the same env steps; an environment whose episodes
+don't follow from its seeds."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,7 @@ ENGINES: tuple[Engine, ...] = (
         trains_many=True,
         lacks={
             "rl_module": "and packs have no networks but their own",
-            "large_images": "and packs are the faster engine up to 300,000",
-            "atari": "and packs do not have what training alone sees of a game",
+            "large_images": "and without a GPU packs are the faster engine up to 300,000",
             "env_runners": "and packs have no env runners",
             "unseeded": "",
         },

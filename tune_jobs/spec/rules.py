@@ -272,7 +272,6 @@ def needs_of(spec: SweepFields) -> dict[Need, str]:
             spec.env.pixels or spec.env.atari is not None,
             "env.pixels is true" if spec.env.atari is None else "env.atari is set",
         ),
-        "atari": (spec.env.atari is not None, "env.atari is set"),
         "env_runners": (runners > 0, f"resources.num_env_runners is {runners}"),
         "copies": (spec.scheduler.is_population, f"scheduler.type is {spec.scheduler.type}"),
         "pauses": (spec.scheduler.type == "hyperband", "scheduler.type is hyperband"),

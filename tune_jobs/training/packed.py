@@ -87,7 +87,8 @@ class PackedEngine:
 
     def _place(self, task: TrialTask, hyperparams: TrainedHyperparams, device: str) -> Hashable:
         """Return the key of the stack for a new member: the one of its kind with the fewest members."""
-        kind = (pack_key(hyperparams), task.env_id, json.dumps(task.env_args), task.failure_penalty)
+        seen = json.dumps([task.env_args, task.failure_penalty, task.atari_training])
+        kind = (pack_key(hyperparams), task.env_id, seen)
         num_turns = self._num_turns or (2 if device.startswith("cuda") else 1)
 
         def num_members(key: Hashable) -> int:
@@ -117,6 +118,7 @@ class PackedEngine:
             task.env_args,
             hyperparams.num_envs,
             failure_penalty=task.failure_penalty,
+            atari_training=task.atari_training,
             kind=kind,
             num_processes=self._num_env_processes,
         )

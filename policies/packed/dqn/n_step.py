@@ -58,7 +58,7 @@ class StackedNStep:
         gamma = np.repeat([self._gamma[name] for name in member_ids], self._num_envs)
         rows = self._empty(len(actions), observations, step.final_observations.reshape(len(actions), -1))
         rows[:, -3], rows[:, -2] = actions, step.rewards
-        rows[:, -1] = np.where(step.terminated, 0.0, gamma)
+        rows[:, -1] = np.where(step.is_last, 0.0, gamma)
         return rows.reshape(len(member_ids), self._num_envs, -1)
 
     def _empty(self, num_rows: int, observations: NDArray[Any], later: NDArray[Any]) -> Floats:
@@ -72,7 +72,7 @@ class StackedNStep:
     def _by_member(
         self, member_ids: Sequence[str], observations: NDArray[Any], actions: NDArray[np.int64], step: Step
     ) -> list[Floats]:
-        found = []
+        found, is_last = [], step.is_last
         for index, name in enumerate(member_ids):
             own = slice(index * self._num_envs, (index + 1) * self._num_envs)
             columns = {
@@ -80,7 +80,7 @@ class StackedNStep:
                 "obs": np.stack([observations[own], step.final_observations[own].reshape(self._num_envs, -1)]),
                 "actions": actions[None, own],
                 "rewards": step.rewards[None, own],
-                "terminated": step.terminated[None, own],
+                "terminated": is_last[None, own],
                 "truncated": step.truncated[None, own],
                 "stepped": np.ones((1, self._num_envs), dtype=np.bool_),
             }

@@ -8,7 +8,8 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -17,7 +18,7 @@ from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules, allowed_modules
 from policies.errors import EnvError
 from policies.packed.envs.runner_sub_envs import make_sub_envs
-from policies.packed.envs.sub_envs import HostDiedError
+from policies.packed.envs.sub_envs import HostDiedError, SubEnvs
 from policies.parents import end_with_parent
 
 _PATIENCE_S = 5.0
@@ -25,17 +26,18 @@ _PATIENCE_S = 5.0
 
 
 class ProcessHost:
-    """A daemon process with some sub-environments; see `Host`.
+    """A daemon process with the sub-environments that `make_sub_envs` returns; see `Host`.
 
     It is spawned, not forked: the pack's process has threads, and with them locks that a fork would leave locked.
     """
 
-    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None) -> None:
+    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None, *, with_lives: bool = False) -> None:
         context = multiprocessing.get_context("spawn")
         self._env_id = env_id
         self._connection, theirs = context.Pipe()
+        make = partial(make_sub_envs, env_id, dict(env_args or {}), with_lives=with_lives)
         self._process = context.Process(
-            target=entry(serve), args=(theirs, env_id, dict(env_args or {}), allowed_modules(), _parent()), daemon=True
+            target=entry(serve), args=(theirs, make, allowed_modules(), _parent()), daemon=True
         )
         self._process.start()
         # Otherwise the pipe would stay open here after the process has ended.
@@ -92,7 +94,7 @@ def _parent() -> tuple[int, bool]:
 
 
 def serve(
-    connection: Connection, env_id: str, env_args: dict[str, Any], modules: tuple[str, ...], parent: tuple[int, bool]
+    connection: Connection, make: Callable[[], SubEnvs], modules: tuple[str, ...], parent: tuple[int, bool]
 ) -> None:
     """Answer a `ProcessHost` until it closes; if its process ends, this one ends too, even inside a step."""
     pid, by_kernel = parent
@@ -101,7 +103,7 @@ def serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     note_signals()
     allow_modules(modules)
-    sub_envs = make_sub_envs(env_id, env_args)
+    sub_envs = make()
     while True:
         try:
             asked = connection.recv()

@@ -12,11 +12,20 @@ from typing_extensions import override
 from policies.envs.checked import is_sound
 from policies.envs.runners import Copy, Runners
 from policies.errors import EnvError
+from policies.packed.envs.game_sub_envs import GameSubEnvs
 from policies.packed.envs.sub_envs import SubEnvs, SubStep, find_unsound
 
 
-def make_sub_envs(env_id: str, env_args: Mapping[str, Any] | None) -> SubEnvs:
-    """Return scalar environments of several members, none yet, stepped together if they can be."""
+def make_sub_envs(env_id: str, env_args: Mapping[str, Any] | None, *, with_lives: bool = False) -> SubEnvs:
+    """Return scalar environments of several members, none yet, stepped together if they can be.
+
+    Args:
+        env_id: Gymnasium id.
+        env_args: The same as for `policies.envs.make.make_env`.
+        with_lives: Whether they are games whose lost lives are told.
+    """
+    if with_lives:
+        return GameSubEnvs(env_id, env_args)
     runners = Runners.of(env_id, env_args)
     return SubEnvs(env_id, env_args) if runners is None else RunnerSubEnvs(env_id, env_args, runners)
 

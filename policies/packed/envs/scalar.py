@@ -48,15 +48,18 @@ class ScalarEnvs:
     """The sub-environments of a pack that trains on any environment; implements `PackedEnvs`.
 
     Sub-environment i of a member is reset from seed + i at first, and without a seed after that. With processes, a
-    member's sub-environments are spread over them evenly. When a process dies, the members that had one in it fail.
-    If they are added again, each gets a process of its own, so that one whose env kills its process harms no other.
+    member's sub-environments are spread over them evenly. One process shares them with this one, which would only wait
+    for it; with more, this one has none, so that an env that kills its process does not kill the pack. When a process
+    dies, the members that had one in it fail. If they are added again, each gets a process of its own, so that one
+    whose env kills its process harms no other.
 
     Args:
         env_id: Gymnasium id.
         env_args: The same as for `policies.envs.make.make_env`.
         num_envs: Sub-environments of each member.
         failure_penalty: Reward of steps that end by failure; None: the env's own reward.
-        num_processes: Processes to step them in; 0: in this one.
+        atari_training: The arguments of an `AtariTraining`, whose learner these are stepped for; None: there is none.
+        num_processes: Processes to step them in; 0: in this one. One shares them with this one.
         rows: Steps all of them at once, in this process; None: one is stepped after the other.
 
     Raises:
@@ -70,6 +73,7 @@ class ScalarEnvs:
         num_envs: int,
         *,
         failure_penalty: float | None = None,
+        atari_training: Mapping[str, bool] | None = None,
         num_processes: int = 0,
         rows: ClassicRows | None = None,
     ) -> None:
@@ -81,6 +85,9 @@ class ScalarEnvs:
         close_env(env)
         self.errors: dict[str, Exception] = {}
         self._penalty = Penalty.find(env_id, self._env_args, failure_penalty)
+        training = atari_training or {}
+        self._with_lives = training.get("terminal_on_life_loss", False)
+        self._clips = training.get("clip_rewards", False)
         self._members = MemberRows(num_envs)
         self._num_processes = num_processes
         self._parts: list[_Part] = [] if rows is None else [_Part(HereHost(ClassicSubEnvs(rows, env_id)))]
@@ -143,6 +150,7 @@ class ScalarEnvs:
         finals = self._zeros(num)
         rewards = np.zeros(num, dtype=np.float32)
         terminated, truncated = np.zeros(num, dtype=np.bool_), np.zeros(num, dtype=np.bool_)
+        lost = np.zeros(num, dtype=np.bool_)
         firsts: dict[int, NDArray[Any]] = {}
         failed: dict[str, EnvError] = {}
         parts = [part for part in self._parts if part.owners]
@@ -154,6 +162,7 @@ class ScalarEnvs:
                 continue
             finals[rows], rewards[rows] = answer.final_observations, answer.rewards
             terminated[rows], truncated[rows] = answer.terminated, answer.truncated
+            lost[rows] = False if answer.lost_lives is None else answer.lost_lives
             firsts |= {int(rows[place]): first for place, first in answer.first_observations.items()}
             failed |= answer.errors
         for member_id, error in failed.items():
@@ -163,15 +172,20 @@ class ScalarEnvs:
             observations = finals.copy()
             observations[list(firsts)] = list(firsts.values())
         for member_id in self.errors:
-            for array in (finals, observations, rewards, terminated, truncated):
+            for array in (finals, observations, rewards, terminated, truncated, lost):
                 array[self._members.of(member_id)] = 0
         self.observations = observations
         ends = Counter(self._members.ids[row // self.num_envs] for row in firsts)
         for member_id, tally in self._tallies.items():
             if member_id not in self.errors:
                 tally.add(self.num_envs, ends[member_id])
-        seen = rewards if self._penalty is None else self._penalty.apply(rewards, terminated)
-        return Step(observations, finals, seen, rewards, terminated, truncated)
+        seen = self._as_learnt(rewards, terminated)
+        return Step(observations, finals, seen, rewards, terminated, truncated, lost if self._with_lives else None)
+
+    def _as_learnt(self, rewards: NDArray[np.float32], terminated: NDArray[np.bool_]) -> NDArray[np.float32]:
+        if self._clips:
+            return np.sign(rewards)
+        return rewards if self._penalty is None else self._penalty.apply(rewards, terminated)
 
     def close(self) -> None:
         """Close all sub-environments and end their processes."""
@@ -193,12 +207,13 @@ class ScalarEnvs:
     def _share_out(self, member_id: str) -> list[tuple[_Part, list[int]]]:
         """Choose hosts for a new member's sub-environments, and which of them each host gets."""
         if member_id in self._suspects:
-            part = _Part(self._make_host(), alone_for=member_id)
+            part = _Part(self._make_host(apart=True), alone_for=member_id)
             self._parts.append(part)
             return [(part, list(range(self.num_envs)))]
         shared = [part for part in self._parts if part.alone_for is None]
-        while len(shared) < max(1, self._num_processes):
-            shared.append(_Part(self._make_host()))
+        while len(shared) < (2 if self._num_processes == 1 else max(1, self._num_processes)):
+            # What is stepped here is first: it is, when its results are asked for, while the other process steps too.
+            shared.append(_Part(self._make_host(apart=self._num_processes > 1 or bool(shared))))
             self._parts.append(shared[-1])
         places: list[list[int]] = [[] for _ in shared]
         for place in range(self.num_envs):
@@ -206,10 +221,10 @@ class ScalarEnvs:
             places[loads.index(min(loads))].append(place)
         return [(part, more) for part, more in zip(shared, places, strict=True) if more]
 
-    def _make_host(self) -> Host:
-        if self._num_processes:
-            return ProcessHost(self._env_id, self._env_args)
-        return HereHost(make_sub_envs(self._env_id, self._env_args))
+    def _make_host(self, *, apart: bool) -> Host:
+        if apart:
+            return ProcessHost(self._env_id, self._env_args, with_lives=self._with_lives)
+        return HereHost(make_sub_envs(self._env_id, self._env_args, with_lives=self._with_lives))
 
     def _find_rows(self) -> None:
         for part in self._parts:

@@ -58,6 +58,8 @@ class SubStep:
     truncated: NDArray[np.bool_]
     errors: dict[str, EnvError]
     """Errors of members whose sub-environments raised one; the other values of these members mean nothing."""
+    lost_lives: NDArray[np.bool_] | None = None
+    """Where a game lost a life and goes on; None: nobody asked."""
 
 
 @dataclass(eq=False)

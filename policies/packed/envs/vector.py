@@ -27,6 +27,13 @@ class Step:
     """The env's own rewards, which returns are the sums of; the same array object if there is no penalty."""
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
+    lost_lives: NDArray[np.bool_] | None = None
+    """Where the step is an end for the learner, as a termination is, but the episode goes on; None: nowhere."""
+
+    @property
+    def is_last(self) -> NDArray[np.bool_]:
+        """Whether nothing that comes later counts for the learner: the episode was terminated, or a life lost."""
+        return self.terminated if self.lost_lives is None else self.terminated | self.lost_lives
 
 
 class PackedEnvs(Protocol):

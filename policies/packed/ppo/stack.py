@@ -53,6 +53,9 @@ class Fragment:
         self.rewards, self.own_rewards = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         """The rewards to learn from, normalised for members with `normalize_rewards`, and the env's own, (T, S)."""
         self.terminated, self.ended = np.empty(shape, dtype=np.bool_), np.empty(shape, dtype=np.bool_)
+        """Where nothing that comes later counts, and where that or the episode was cut off, (T, S)."""
+        self.own_ended = np.empty(shape, dtype=np.bool_)
+        """Where the env's own episodes end, (T, S)."""
         self.cuts: list[tuple[int, int, NDArray[Any]]] = []
         """The step, the row and the last observation of each truncated episode."""
         self.last: NDArray[Any] = np.empty((num_rows, seen.num_observed), dtype=seen.dtype)
@@ -119,7 +122,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         num_steps = math.ceil(self._shared.train_batch_size / self.envs.num_envs)
         fragment = self._sample(num_steps)
         episodes = self._episodes.follow(
-            [member.member_id for member in self.members], fragment.own_rewards, fragment.ended
+            [member.member_id for member in self.members], fragment.own_rewards, fragment.own_ended
         )
         for member, ended in zip(self.members, episodes, strict=True):
             member.num_env_steps += num_steps * self.envs.num_envs
@@ -176,8 +179,9 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
             chosen.append(actions)
             done = envs.step(self._to_env(actions))
             fragment.rewards[step], fragment.own_rewards[step] = done.rewards, done.own_rewards
-            fragment.terminated[step] = done.terminated
-            fragment.ended[step] = done.terminated | done.truncated
+            fragment.terminated[step] = done.is_last
+            fragment.ended[step] = done.is_last | done.truncated
+            fragment.own_ended[step] = done.terminated | done.truncated
             if done.truncated.any():
                 cut = np.flatnonzero(done.truncated & ~done.terminated)
                 fragment.cuts += [(step, row, done.final_observations[row].reshape(-1)) for row in cut.tolist()]
