@@ -55,6 +55,11 @@ main({parent}, {connection}, {page}, {dump})
 """
 
 
+_THREADS = "OMP_NUM_THREADS"
+_VARIABLES = ("PYTHONPATH", ENVIRONMENT_VARIABLE, _THREADS)
+"""What a child reads of the environment as it begins."""
+
+
 @dataclass(frozen=True)
 class _Surroundings:
     """The surroundings that a child was started with; where they change, a new child is started."""
@@ -69,7 +74,7 @@ class _Surroundings:
         script = os.path.dirname(os.path.realpath(sys.argv[0]))  # noqa: PTH120 (the same way as Ray)
         if hasattr(sys.modules.get("__main__"), "__file__") and script in sys.path:
             folders.append(script)
-        return cls(tuple(folders), tuple(os.environ.get(name) for name in ("PYTHONPATH", ENVIRONMENT_VARIABLE)))
+        return cls(tuple(folders), tuple(map(os.environ.get, _VARIABLES)))
 
 
 class _Child:
@@ -96,6 +101,9 @@ class _Child:
         try:
             self.process = subprocess.Popen(  # noqa: S603 (this very Python)
                 [sys.executable, "-P", "-c", code],
+                # As in processes of trials. Threads of a product of matrices spin while they wait for each other: where
+                # the cores have other work, a policy took 60 times as long for an image of Atari's.
+                env={_THREADS: "1", **os.environ},
                 stdin=subprocess.DEVNULL,
                 pass_fds=numbers,
                 # Ctrl-C in a terminal reaches only the parent, which then ends the child.

@@ -1,5 +1,6 @@
 """Environments outside of trials: whatever they do, this process goes on, and says what they did."""
 
+import json
 import os
 import re
 import signal
@@ -124,6 +125,43 @@ def test_the_import_of_a_module_is_a_call_too(tmp_path: Path, monkeypatch: pytes
     allow_modules(["endless_module"])
     with pytest.raises(EnvFailedError, match=r"hangs in the import of its module.*\n.*endless_module.py"):
         guarded.check_env("endless_module:Env", {}, timeout_s=0.7)
+
+
+COUNTS_THREADS = """
+import json
+from pathlib import Path
+
+import gymnasium as gym
+from gymnasium.envs.classic_control import CartPoleEnv
+from threadpoolctl import threadpool_info
+
+
+class Env(CartPoleEnv):
+    def __init__(self, file):
+        super().__init__()
+        counts = [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+        Path(file).write_text(json.dumps(counts))
+"""
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="there is one core, and so one thread in any case")
+@pytest.mark.parametrize(("said", "threads"), [(None, 1), ("2", 2)])
+def test_matrices_are_multiplied_by_one_thread_unless_the_user_says_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str | None, threads: int
+) -> None:
+    (tmp_path / "counting_threads.py").write_text(COUNTS_THREADS)
+    monkeypatch.syspath_prepend(tmp_path)
+    allow_modules(["counting_threads"])
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    if said is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", said)
+    file = tmp_path / "threads.json"
+    with guarding():
+        guarded.check_env("counting_threads:Env", {"file": str(file)})
+    found = json.loads(file.read_text())
+    assert found
+    assert set(found) == {threads}
 
 
 def test_what_the_child_finds_wrong_is_raised_as_here() -> None:
