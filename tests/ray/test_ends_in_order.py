@@ -165,3 +165,26 @@ def test_parts_of_ray_that_die_one_after_the_other(start: Start, tmp_path: Path)
     assert process.returncode == 130, out + err
     statuses = {json.loads(path.read_text())["status"] for path in folder.glob("trials/*/trial.json")}
     assert statuses <= {"paused", "pending"}
+
+
+@pytest.mark.parametrize("dies", ["", "raylet"])
+def test_a_signal_to_all_processes_is_an_interruption(start: Start, tmp_path: Path, dies: str) -> None:
+    """As `timeout`, Slurm and systemd send it: Ray's own processes may end before the sweep has."""
+    folder = tmp_path / "sweeps" / "cut"
+    process = start(start_new_session=True)
+    wait_until(functools.partial(has_new, folder, set()), process)
+    victim = child(process.pid, dies) if dies else None
+    if victim is not None:
+        os.kill(victim, signal.SIGKILL)
+        process.send_signal(signal.SIGTERM)
+    else:
+        os.killpg(process.pid, signal.SIGTERM)
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 130, out + err
+    assert err.strip().splitlines()[-1] == ("Interrupted; what is done is kept. Continue with: tune-jobs resume cut"), (
+        err
+    )
+    assert "died" not in err
+    assert state(folder) == "interrupted"
+    statuses = {json.loads(path.read_text())["status"] for path in folder.glob("trials/*/trial.json")}
+    assert statuses <= {"paused", "pending"}

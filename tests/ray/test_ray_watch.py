@@ -76,6 +76,21 @@ def test_a_block_that_goes_on_is_stuck() -> None:
     assert deaths == ["it"]
 
 
+def test_a_block_that_was_asked_to_end_is_stuck_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tune_jobs.ray_tune import processes
+
+    monkeypatch.setattr(processes, "_STOPPING_S", 0.05)
+    told = threading.Event()
+    with processes.RayWatch({"it": lambda: False}, 0.05, stuck_s=3600) as watch:
+        watch.when_stuck = lambda death: told.set()
+        watch.hurries = lambda: True
+        assert told.wait(60)
+    told.clear()
+    with processes.RayWatch({"it": lambda: False}, 0.05, stuck_s=3600) as watch:
+        watch.when_stuck = lambda death: told.set()
+        assert not told.wait(1)
+
+
 def test_it_looks_by_itself_and_ends_with_its_block() -> None:
     from tune_jobs.ray_tune.processes import RayDiedError, RayWatch, _answers
 

@@ -26,6 +26,7 @@ _OWN_GRACE_S, _CLUSTER_GRACE_S = 4.0, 15.0
 
 # A block that is told so is left at once, unless it waits in a native call that only Ray could end.
 _STUCK_S = 20.0
+_STOPPING_S = 5.0
 
 _CONTROL, _RAYLET = "control process (GCS)", "process on this node (raylet)"
 
@@ -98,6 +99,8 @@ class RayWatch:
         self._over = threading.Event()
         self.when_stuck: Callable[[RayDiedError], None] | None = None
         """Called in the background if the block is stuck although a part is dead, as Ray would end the process soon."""
+        self.hurries: Callable[[], bool] = lambda: False
+        """Whether the block was asked to end: it counts as stuck sooner, as who asked may soon kill the process."""
         self._thread = threading.Thread(target=self._run, name="tune-jobs-ray-watch", daemon=True)
 
     @classmethod
@@ -165,7 +168,9 @@ class RayWatch:
         # Not more often, because a raylet writes a line into its log for each such connection.
         while self._dead is None and not self._over.wait(self._grace_s / 4):
             self.look()
-        if self._dead is not None and not self._over.wait(self._stuck_s) and self.when_stuck is not None:
+        if self._dead is None or self.when_stuck is None:
+            return
+        if not self._over.wait(min(self._stuck_s, _STOPPING_S) if self.hurries() else self._stuck_s):
             self.when_stuck(RayDiedError(self._dead))
 
 

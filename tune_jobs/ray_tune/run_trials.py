@@ -52,6 +52,8 @@ from tune_jobs.store.storage_watch import StorageWatch
 
 # How long running trials may take to save a checkpoint after they were asked to stop, before they are ended.
 STOP_GRACE_S = 20.0
+_INTERRUPTED = 130
+"""The exit code of a process that was asked to end, as `SweepResult` has it."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
 
     Raises:
         OwnershipLostError: Another process runs the sweep by now; nothing was written over its records.
-        CannotRunError: A part of Ray died; the records are written.
+        CannotRunError: A part of Ray died though nobody had asked for the end; the records are written.
     """
     prepare_environment()
     store = open_sweep(job.sweep_place)
@@ -99,18 +101,17 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     with RayWatch.of_this_process() as watch:
         run = _Run(job, store, listener, owner, watch)
         watch.when_stuck = functools.partial(_give_up, run, go_on)
+        watch.hurries = run.keeper.stop_requested
         try:
             run.all_trials()
         except (RayDiedError, Exception) as error:
-            if isinstance(error, RayDiedError):
-                raise ray_died(go_on, error) from error
-            # Errors that Ray raises when a part of it is gone do not name the cause.
-            try:
-                watch.check_after(error)
-            except RayDiedError as death:
+            death = _death_behind(error, watch)
+            if death is None:
+                with _saying_how_to_go_on(go_on):
+                    raise
+            # A signal that asks for the end may have been sent to Ray's processes, too, which ended sooner.
+            if not run.keeper.stop_requested():
                 raise ray_died(go_on, death) from error
-            with _saying_how_to_go_on(go_on):
-                raise
         finally:
             # What ended the run may keep the last records from being written too, and is told in this way then.
             with current().shielded(), _saying_how_to_go_on(go_on):
@@ -118,6 +119,17 @@ def run_trials(job: RunJob, listener: Listener) -> None:
                     run.waits.end()
                 run.keeper.close()
                 owner.release()
+
+
+def _death_behind(error: BaseException, watch: RayWatch) -> RayDiedError | None:
+    """Return the death of a part of Ray that caused an error, or None: those that Ray raises do not name the cause."""
+    if isinstance(error, RayDiedError):
+        return error
+    try:
+        watch.check_after(error)
+    except RayDiedError as death:
+        return death
+    return None
 
 
 @contextlib.contextmanager
@@ -321,4 +333,7 @@ def _give_up(run: _Run, go_on: str, death: RayDiedError) -> None:
     from tune_jobs.store.closing import end_process
 
     run.keeper.close()
-    end_process(run.store, ray_died(go_on, death))
+    if run.keeper.stop_requested():
+        end_process(run.store, f"Interrupted; what is done is kept. Continue with: {go_on}", _INTERRUPTED)
+    error = ray_died(go_on, death)
+    end_process(run.store, f"error: {error}", error.exit_code)

@@ -8,19 +8,19 @@ import time
 from typing import NoReturn
 
 from analysis.records import FINISHED
-from policies.errors import CannotRunError, TuneJobsError
+from policies.errors import TuneJobsError
 from tune_jobs.store import transitions
 from tune_jobs.store.contract import Sweep
 
 
-def end_process(store: Sweep, error: CannotRunError) -> NoReturn:
-    """Write how the run ended, print the error, and end this process at once; any thread may call this."""
+def end_process(store: Sweep, last_words: str, exit_code: int) -> NoReturn:
+    """Write how the run ended, print why, and end this process at once; any thread may call this."""
     from tune_jobs.process.streams import say_at_last
 
     with contextlib.suppress(TuneJobsError):
         close_run(store)
-    say_at_last(f"error: {error}")
-    os._exit(error.exit_code)
+    say_at_last(last_words)
+    os._exit(exit_code)
 
 
 def close_run(store: Sweep, started: float | None = None) -> None:
