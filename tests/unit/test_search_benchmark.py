@@ -6,11 +6,18 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Generator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from policy_factory import make_portable
 
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.policy import NetworkPolicy
+from policies.envs import modules as env_modules
+from policies.portable.network import Layer, PolicyNetwork
 from tests.benchmarks.search import confirmed_runs, envs
 from tests.benchmarks.search import trainings as module
 from tests.benchmarks.search.__main__ import DATA
@@ -251,6 +258,25 @@ def test_the_time_limit_of_mountain_car_is_an_end() -> None:
         == f"{envs.__name__}:EndingMountainCar-v0"
         == f"{ENVS}:EndingMountainCar-v0"
     )
+
+
+def test_the_greedy_episodes_of_mountain_car_are_those_of_the_env_that_is_played_all_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A policy that pushes where the car goes reaches the goal, at another step for each seed."""
+    monkeypatch.setattr(env_modules, "_allowed", {ENVS})
+    task = TASKS["mountaincar-dqn"]
+    assert task.evaluation_env_id == "MountainCar-v0"
+    q_values = Layer(np.array([[0, -1], [0, 0], [0, 1]], np.float32), np.array([0, -0.01, 0], np.float32), "linear")
+    portable = replace(make_portable("MountainCar-v0"), network=PolicyNetwork("q_values", (q_values,)))
+    seeds = task.evaluation_seeds[:16]
+    ours, theirs = (
+        evaluate_policy(NetworkPolicy(portable), env_id=env_id, seeds=seeds, env_args=task.spec.env.wrapped_args)
+        for env_id in (task.evaluation_env_id, task.spec.env.id)
+    )
+    assert ours == theirs
+    assert len(set(ours.returns)) > 3
+    assert max(ours.returns) > -180
 
 
 def first_seed_flatters(point: Mapping[str, Any], seed: int) -> float | None:

@@ -67,7 +67,7 @@ class PackTrainer:
         allow_modules([ENVS])
         self._task, self._in_step = task, in_step
         self._engine = PackedEngine()
-        self._evaluator = Evaluator(task.spec.env.id, task.spec.env.wrapped_args, task.evaluation_seeds)
+        self._evaluator = Evaluator(task.evaluation_env_id, task.spec.env.wrapped_args, task.evaluation_seeds)
         self._members: dict[str, list[str]] = {}
         self._tasks: dict[str, TrialTask] = {}
 

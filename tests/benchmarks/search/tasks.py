@@ -21,6 +21,8 @@ TEST_SEEDS = (100, 101, 102, 103, 104)
 """Training seeds on which a run's best point is judged, and nothing is chosen; ARLBench's begin at 100, too."""
 EVALUATION_SEEDS = tuple(range(1_000_000, 1_000_128))
 """128 greedy episodes end a training, as in ARLBench."""
+_EVALUATED_AS = {"tests.benchmarks.search.envs:EndingMountainCar-v0": "MountainCar-v0"}
+"""Environments whose greedy episodes are another's, which are played all at once: how an episode ends is not seen."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,11 @@ class Task:
         found = replace(self)
         vars(found)["spec"] = spec
         return found
+
+    @property
+    def evaluation_env_id(self) -> str:
+        """The environment in which a training's greedy episodes are played."""
+        return _EVALUATED_AS.get(self.spec.env.id, self.spec.env.id)
 
     @property
     def evaluation_seeds(self) -> tuple[int, ...]:
