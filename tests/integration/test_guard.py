@@ -128,23 +128,19 @@ def test_the_import_of_a_module_is_a_call_too(tmp_path: Path, monkeypatch: pytes
 
 
 COUNTS_THREADS = """
-import json
-from pathlib import Path
-
-import gymnasium as gym
+import json, pathlib
 from gymnasium.envs.classic_control import CartPoleEnv
 from threadpoolctl import threadpool_info
-
 
 class Env(CartPoleEnv):
     def __init__(self, file):
         super().__init__()
         counts = [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
-        Path(file).write_text(json.dumps(counts))
+        pathlib.Path(file).write_text(json.dumps(counts))
 """
 
 
-@pytest.mark.skipif(os.cpu_count() == 1, reason="there is one core, and so one thread in any case")
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) == 1, reason="there is one core, and so one thread in any case")
 @pytest.mark.parametrize(("said", "threads"), [(None, 1), ("2", 2)])
 def test_matrices_are_multiplied_by_one_thread_unless_the_user_says_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str | None, threads: int

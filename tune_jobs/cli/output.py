@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, return_text, setting_text
+from tune_jobs.process.interruption import last_words
 from tune_jobs.sweeps.plain import to_json
 
 if TYPE_CHECKING:
@@ -87,9 +88,7 @@ def print_outcome(
 
 def say_interrupted(sweep: SweepRecord, how_to_resume: str) -> None:
     """Say on standard error that a sweep was interrupted, and the command that continues it."""
-    done = sweep.state == "completed"
-    kept = "all trials are done. Make what is missing with" if done else "what is done is kept. Continue with"
-    click.echo(f"Interrupted; {kept}: {how_to_resume}", err=True)
+    click.echo(last_words(how_to_resume, is_done=sweep.state == "completed"), err=True)
 
 
 def storage_option_of(storage: str | None) -> str:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tune_jobs.spec.sweep_spec import SweepSpec
 
 MAX_PRODUCTS = 300_000
-"""The most multiplications of a network for an image that packs are chosen for.
+"""The most multiplications of a network for an image that packs are chosen for where trials have no GPU.
 
 Measured by CPU time beside the `rllib` engine (decision 49): 1.7 to 2.8 times as fast up to 200,000, 1.0 to 1.9 times
 at 480,000, and slower from 1.7 million on, where the products are what takes time, and those of RLlib are as fast.
@@ -208,7 +208,7 @@ class _Images:
         """Return why an engine is not chosen for a trial, or None if it is; None for a point that is not known."""
         if self._spec.engine == engine.name or "large_images" not in engine.lacks or not self._env.observes_images:
             return None
-        if self._spec.resources.num_gpus:
+        if self._spec.resources.num_gpus:  # decision 54
             return None
         if hyperparams is None and not self._largest and self._known:
             self._largest = largest_hyperparams(self._spec, self._known)

@@ -21,7 +21,20 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 ASKED = signal.SIGUSR1
+EXIT_CODE = 130
+"""Of a process whose sweep was interrupted."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def last_words(how_to_resume: str, *, is_done: bool = False) -> str:
+    """Return what is said of a sweep that was interrupted, with the command that continues it.
+
+    Args:
+        how_to_resume: The command.
+        is_done: Whether all trials are done.
+    """
+    kept = "all trials are done. Make what is missing with" if is_done else "what is done is kept. Continue with"
+    return f"Interrupted; {kept}: {how_to_resume}"
 
 
 class Interruption:

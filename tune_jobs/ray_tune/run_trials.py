@@ -22,7 +22,7 @@ from ray.tune.search import SearchAlgorithm, Searcher
 from policies.errors import CannotRunError
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
-from tune_jobs.process.interruption import current
+from tune_jobs.process.interruption import EXIT_CODE, current, last_words
 from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
 from tune_jobs.ray_tune.environment import prepare_environment
@@ -52,8 +52,6 @@ from tune_jobs.store.storage_watch import StorageWatch
 
 # How long running trials may take to save a checkpoint after they were asked to stop, before they are ended.
 STOP_GRACE_S = 20.0
-_INTERRUPTED = 130
-"""The exit code of a process that was asked to end, as `SweepResult` has it."""
 
 
 @dataclass(frozen=True)
@@ -334,6 +332,6 @@ def _give_up(run: _Run, go_on: str, death: RayDiedError) -> None:
 
     run.keeper.close()
     if run.keeper.stop_requested():
-        end_process(run.store, f"Interrupted; what is done is kept. Continue with: {go_on}", _INTERRUPTED)
+        end_process(run.store, last_words(go_on), EXIT_CODE)
     error = ray_died(go_on, death)
     end_process(run.store, f"error: {error}", error.exit_code)
