@@ -89,6 +89,9 @@ def test_a_block_that_was_asked_to_end_is_stuck_sooner(monkeypatch: pytest.Monke
     with processes.RayWatch({"it": lambda: False}, 0.05, stuck_s=3600) as watch:
         watch.when_stuck = lambda death: told.set()
         assert not told.wait(1)
+        # Somebody asks after the part has died.
+        watch.hurries = lambda: True
+        assert told.wait(60)
 
 
 def test_it_looks_by_itself_and_ends_with_its_block() -> None:

@@ -1,7 +1,10 @@
 """Signals and threads while a sweep runs: who is asked, what raises, and that one process runs one sweep at a time."""
 
+import ctypes
 import os
 import signal
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from signal import Signals
@@ -139,6 +142,77 @@ def test_nohup_means_it(number: Signals) -> None:
         assert signal.getsignal(number) == signal.SIG_IGN
     finally:
         signal.signal(number, before)
+
+
+def test_a_signal_is_known_while_the_main_thread_is_in_native_code() -> None:
+    """There its handler is called only afterwards; a lock of the C library, unlike most calls, waits on regardless."""
+    library = ctypes.CDLL(None)
+    lock = ctypes.create_string_buffer(64)
+    held, known = threading.Event(), []
+
+    def send_and_look() -> None:
+        library.pthread_mutex_lock(lock)
+        held.set()
+        time.sleep(0.5)
+        known.append(interruption.has_arrived())
+        send(signal.SIGTERM)
+        deadline = time.monotonic() + 60
+        while not interruption.has_arrived() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        known.extend((interruption.has_arrived(), interruption.came))
+        library.pthread_mutex_unlock(lock)
+
+    with taking_signals() as interruption:
+        thread = threading.Thread(target=send_and_look)
+        thread.start()
+        held.wait()
+        with interruption.asking(lambda: None):
+            library.pthread_mutex_lock(lock)
+        thread.join()
+        assert known == [False, True, False]
+        assert interruption.came
+    assert interruption.has_arrived()
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_other_signals_are_not_taken_for_one_that_asks_for_the_end() -> None:
+    before = signal.signal(signal.SIGWINCH, lambda number, frame: None)
+    try:
+        with taking_signals() as interruption:
+            send(signal.SIGWINCH)
+            assert not interruption.has_arrived()
+    finally:
+        signal.signal(signal.SIGWINCH, before)
+
+
+def test_signals_of_a_forked_process_are_not_taken_for_this_ones() -> None:
+    with taking_signals() as interruption:
+        child = os.fork()
+        if child == 0:
+            signal.signal(signal.SIGTERM, lambda number, frame: os._exit(7))
+            os.kill(os.getpid(), signal.SIGTERM)
+            os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+        assert not interruption.has_arrived()
+
+
+def test_what_a_process_has_set_for_arriving_signals_stays() -> None:
+    """As an event loop that handles signals does; then one is known when its handler is called."""
+    reading, writing = os.pipe()
+    try:
+        os.set_blocking(writing, False)
+        signal.set_wakeup_fd(writing)
+        with taking_signals() as interruption:
+            assert not interruption.has_arrived()
+            with interruption.asking(lambda: None):
+                send(signal.SIGTERM)
+            assert interruption.has_arrived()
+        assert os.read(reading, 8) == bytes([signal.SIGTERM])
+        assert signal.set_wakeup_fd(-1) == writing
+    finally:
+        signal.set_wakeup_fd(-1)
+        os.close(reading)
+        os.close(writing)
 
 
 def test_an_interrupted_run_raises_with_what_there_is() -> None:

@@ -20,6 +20,8 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from tune_jobs.process.arrivals import noting_arrivals
+
 ASKED = signal.SIGUSR1
 EXIT_CODE = 130
 """Of a process whose sweep was interrupted."""
@@ -51,6 +53,20 @@ class Interruption:
         """Whether a signal had an effect, and was not only noted."""
         self._num_shields = 0
         self._ask: Callable[[], None] | None = None
+        self._arrived: Callable[[], frozenset[int]] = frozenset
+
+    def has_arrived(self) -> bool:
+        """Whether a signal came, though its handler may not have been called: the main thread may be in native code.
+
+        Any thread may ask this.
+        """
+        return self.came or not self._arrived().isdisjoint((*_SIGNALS, ASKED))
+
+    @contextlib.contextmanager
+    def noting(self) -> Iterator[None]:
+        """Know of signals that arrive in the block at once, for `has_arrived`; for the main thread."""
+        with noting_arrivals() as self._arrived:
+            yield
 
     def take(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 (the signature of a handler)
         """Handle a signal: ask the trials to stop, only note it, or raise an error.
@@ -142,7 +158,7 @@ def taking_signals() -> Iterator[Interruption]:
     interruption = Interruption()
     try:
         _current, _is_driving = interruption, True
-        with _handled(interruption):
+        with interruption.noting(), _handled(interruption):
             yield interruption
     finally:
         _current, _is_driving = Interruption(has_acted=interruption.came), False

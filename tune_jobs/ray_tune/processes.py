@@ -170,8 +170,12 @@ class RayWatch:
             self.look()
         if self._dead is None or self.when_stuck is None:
             return
-        if not self._over.wait(min(self._stuck_s, _STOPPING_S) if self.hurries() else self._stuck_s):
-            self.when_stuck(RayDiedError(self._dead))
+        since = time.monotonic()
+        while not self._over.wait(min(self._grace_s, self._stuck_s) / 4):
+            # Asked each time: a part may be dead before anybody asks for the end.
+            if time.monotonic() - since >= (min(self._stuck_s, _STOPPING_S) if self.hurries() else self._stuck_s):
+                self.when_stuck(RayDiedError(self._dead))
+                return
 
 
 def _answers(family: int, address: tuple[str, int] | str) -> bool:

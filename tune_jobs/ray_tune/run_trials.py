@@ -98,8 +98,10 @@ def run_trials(job: RunJob, listener: Listener) -> None:
     go_on = resume_command(store, record)
     with RayWatch.of_this_process() as watch:
         run = _Run(job, store, listener, owner, watch)
-        watch.when_stuck = functools.partial(_give_up, run, go_on)
-        watch.hurries = run.keeper.stop_requested
+        # Asked here, as only the main thread is told; Ray may be what keeps it from being told in time.
+        arrived = current().has_arrived
+        watch.hurries = lambda: arrived() or run.keeper.stop_requested()
+        watch.when_stuck = functools.partial(_give_up, run, watch, go_on)
         try:
             run.all_trials()
         except (RayDiedError, Exception) as error:
@@ -108,7 +110,7 @@ def run_trials(job: RunJob, listener: Listener) -> None:
                 with _saying_how_to_go_on(go_on):
                     raise
             # A signal that asks for the end may have been sent to Ray's processes, too, which ended sooner.
-            if not run.keeper.stop_requested():
+            if not watch.hurries():
                 raise ray_died(go_on, death) from error
         finally:
             # What ended the run may keep the last records from being written too, and is told in this way then.
@@ -323,7 +325,7 @@ class _StopWhenAsked(tune.Stopper):  # type: ignore[misc]
         return not self._keeper.running or time.monotonic() - self._asked_at > STOP_GRACE_S
 
 
-def _give_up(run: _Run, go_on: str, death: RayDiedError) -> None:
+def _give_up(run: _Run, watch: RayWatch, go_on: str, death: RayDiedError) -> None:
     """Save the records and end this process, whose main thread waits for Ray; Ray would end it within a minute.
 
     This is done in the background because the main thread is blocked, so it cannot change anything meanwhile.
@@ -331,7 +333,7 @@ def _give_up(run: _Run, go_on: str, death: RayDiedError) -> None:
     from tune_jobs.store.closing import end_process
 
     run.keeper.close()
-    if run.keeper.stop_requested():
+    if watch.hurries():
         end_process(run.store, last_words(go_on), EXIT_CODE)
     error = ray_died(go_on, death)
     end_process(run.store, f"error: {error}", error.exit_code)
