@@ -10,6 +10,7 @@ import sys
 import venv
 from collections.abc import Sequence
 from importlib.metadata import Distribution, distribution
+from importlib.util import cache_from_source
 from pathlib import Path
 
 import pytest
@@ -75,18 +76,24 @@ def needed_by(installed: Distribution) -> list[Distribution]:
 
 
 def link_files(installed: Distribution, packages: Path) -> None:
-    """Let another environment have a distribution's files, without commands and what Python compiled."""
+    """Let another environment have a distribution's files, without commands, and what Python compiled of them."""
     for file in installed.files or ():
         if ".." in file.parts or file.suffix == ".pyc":
             continue
-        target = packages / file
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.link(str(file.locate()), target)
-        except OSError:
-            # On another disk.
-            shutil.copyfile(str(file.locate()), target)
-            shutil.copymode(str(file.locate()), target)
+        source, target = Path(str(file.locate())), packages / file
+        link(source, target)
+        if file.suffix == ".py" and (compiled := Path(cache_from_source(str(source)))).is_file():
+            link(compiled, Path(cache_from_source(str(target))))
+
+
+def link(source: Path, target: Path) -> None:
+    """Let a file have another path, too, with the time by which Python knows whether what it compiled is of now."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        # On another disk.
+        shutil.copy2(source, target)
 
 
 def call(command: Sequence[str], cwd: Path) -> str:
