@@ -61,18 +61,20 @@ $(VENV)/installed-bench: $(VENV)/installed
 	@$(COMPILE)
 	@touch $@
 
-# In five processes on two cores, as many of the tests wait for processes of their own: two for those in tests/ray, each
-# with a Ray of its own and a file at a time, two for the unit tests, and one for the others; with the types beside them.
+# In six processes on two cores, as many of the tests wait for processes of their own: two for those in tests/ray, each
+# with a Ray of its own and a file at a time, two for the unit tests, and two for the others, a file at a time and the
+# longest first; with the types beside them.
 # What they print, skipped tests with their reasons too, comes at the end. Processes by the hundred import the same
 # modules: these are compiled once, whatever else the environment says.
-OTHERS := $(filter-out tests/ray/ tests/unit/,$(sort $(dir $(wildcard tests/*/test_*.py))))
+OTHERS := tests/package/ $(filter-out tests/package/ tests/ray/ tests/unit/,$(sort $(dir $(wildcard tests/*/test_*.py))))
+BY_FILE := --numprocesses=2 --dist=loadfile --no-loadscope-reorder
 PYTEST := $(BIN)/python -m pytest --durations=15 --durations-min=5
 test unit: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/installed-test lint
 	@$(BIN)/mypy > $(VENV)/types.log 2>&1 & types=$$!; \
-	$(PYTEST) --numprocesses=2 --dist=loadfile --no-loadscope-reorder tests/ray > $(VENV)/tests-ray.log 2>&1 & ray=$$!; \
+	$(PYTEST) $(BY_FILE) tests/ray > $(VENV)/tests-ray.log 2>&1 & ray=$$!; \
 	$(PYTEST) --numprocesses=2 tests/unit > $(VENV)/tests-unit.log 2>&1 & unit=$$!; \
-	$(PYTEST) $(OTHERS); others=$$?; \
+	$(PYTEST) $(BY_FILE) $(OTHERS); others=$$?; \
 	wait $$unit; unit=$$?; cat $(VENV)/tests-unit.log; \
 	wait $$ray; ray=$$?; cat $(VENV)/tests-ray.log; \
 	wait $$types; types=$$?; cat $(VENV)/types.log; \
