@@ -8,8 +8,7 @@ import click
 
 from tune_jobs.cli.base import json_option, losing_what_nobody_reads, stdout_for, storage_option, sweep_argument
 from tune_jobs.cli.server import here_only
-
-_INTERRUPTED = 130
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 
 
 @click.command()
@@ -48,8 +47,8 @@ def show_until_end(sweep: str, *, storage: str | None, progress: str, as_json: b
         with losing_what_nobody_reads(True):  # noqa: FBT003
             click.echo(f"{message} {hint}", err=True)
             if as_json:
-                output.print_json({"error": message, "hint": hint, "exit_code": _INTERRUPTED})
-        return _INTERRUPTED
+                output.print_json({"error": message, "hint": hint, "exit_code": INTERRUPTED})
+        return INTERRUPTED
     with losing_what_nobody_reads(result.interrupted):
         output.show_result(result, as_json=as_json)
     return result.exit_code

@@ -15,11 +15,12 @@ import click
 
 from policies.errors import CannotRunError, TuneJobsError, said_by
 from tune_jobs.cli.completion import complete_folders, complete_sources, complete_sweeps
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 
 if TYPE_CHECKING:
     from tune_jobs.sweeps.outcome import SweepResult
 
-_INTERRUPTED, _CANNOT_PRINT = 130, CannotRunError.exit_code
+_CANNOT_PRINT = CannotRunError.exit_code
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UNCHANGED = {
@@ -50,8 +51,8 @@ class CommandGroup(click.Group):
         except KeyboardInterrupt as interruption:
             hint = _hint_after(interruption, ctx.invoked_subcommand or "")
             with losing_what_nobody_reads(True):  # noqa: FBT003
-                _print_error(ctx, "Interrupted.", hint, _INTERRUPTED)
-            ctx.exit(_INTERRUPTED)
+                _print_error(ctx, "Interrupted.", hint, INTERRUPTED)
+            ctx.exit(INTERRUPTED)
         except TuneJobsError as error:
             if ctx.meta.get(DEBUG):
                 traceback.print_exc()

@@ -16,13 +16,13 @@ from tune_jobs.cli.base import losing_what_nobody_reads, stdout_for
 from tune_jobs.cli.remote import told_here
 from tune_jobs.cli.server import Server
 from tune_jobs.client.answers import Job, Summary
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 
 if TYPE_CHECKING:
     from tune_jobs.client import Client
 
 _LINE_INTERVAL_S = 10.0
 """As of a sweep that runs here without a terminal."""
-_INTERRUPTED = 130
 _MOST_POINT = 60
 _STATES = {"creating": "is being written", "waiting": "waits for its turn", "running": "runs", "ended": "has ended"}
 _ARTIFACTS = {
@@ -105,8 +105,8 @@ def _say_left(left: _Left, *, as_json: bool) -> int:
         if as_json:
             from tune_jobs.cli.output import print_json
 
-            print_json({"error": left.message, "hint": left.hint, "exit_code": _INTERRUPTED})
-    return _INTERRUPTED
+            print_json({"error": left.message, "hint": left.hint, "exit_code": INTERRUPTED})
+    return INTERRUPTED
 
 
 def _begun(client: Client, verb: str, arguments: Sequence[Any], options: dict[str, Any]) -> Job:
@@ -193,7 +193,7 @@ def _result(client: Client, job: Job) -> dict[str, Any]:
         "interrupted": not is_whole,
         "notes": [job.message] if is_whole and best is not None and job.message else [],
         "finish_failed": is_whole and best is None,
-        "exit_code": _INTERRUPTED if not is_whole else 3 if has_failed or best is None else 0,
+        "exit_code": INTERRUPTED if not is_whole else 3 if has_failed or best is None else 0,
     }
 
 

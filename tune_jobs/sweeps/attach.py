@@ -10,6 +10,7 @@ from pathlib import Path
 from analysis.records import SweepRecord, TrialRecord
 from policies.arguments import checked
 from policies.errors import CannotRunError, CheckpointError
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 from tune_jobs.ray_tune.jobs import Job
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import readable_trials
@@ -180,7 +181,7 @@ def _read(store: Sweep, trial_ids: Iterable[str]) -> list[TrialRecord]:
 
 
 def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
-    is_whole = record.state == "completed" and (job is None or job.driver_exit_code != 130)
+    is_whole = record.state == "completed" and (job is None or job.driver_exit_code != INTERRUPTED)
     trials = readable_trials(store)
     best = store.read_best() if is_whole and has_current_best(store, trials) else None
     artifacts: dict[str, Path] = {}

@@ -15,6 +15,7 @@ from policies.envs.modules import allowed_again, allowed_modules
 from policies.errors import CannotRunError, NotFoundError, SpecError, TuneJobsError, fit
 from policies.guard.guard import guarding
 from tune_jobs.plan.user_code import Source, load_source, modules_of
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 from tune_jobs.ray_tune.jobs import Job, JobsApi, JobState, check_jobs_address
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
@@ -28,7 +29,7 @@ _BEGIN_S = 60.0
 """How long is waited for a job to begin; one that waits for nodes may take longer, and goes on without this process."""
 _POLL_S = 0.5
 _ASK_S = 2.0
-_HAS_RUN = (0, 3, 130)
+_HAS_RUN = (0, 3, INTERRUPTED)
 """Exit codes of a driver that ran the sweep; Ray calls a job that ends with 3 or 130 failed, too."""
 _MAX_SAID = 1_000
 

@@ -13,6 +13,7 @@ from analysis.notebook import brief_repr, facts_html
 from analysis.records import SweepRecord, SweepState, TrialRecord, TrialStatus
 from analysis.report_data import is_trained
 from analysis.wording import counted, return_text
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 from tune_jobs.sweeps.storage import folder_at, shown_place
 
 Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
@@ -60,7 +61,7 @@ class SweepResult:
     def exit_code(self) -> int:
         """130 if it was interrupted, 3 if a trial or what comes after the trials failed, else 0."""
         if self.interrupted:
-            return 130
+            return INTERRUPTED
         return 3 if self.finish_failed or any(trial.status == "failed" for trial in self.trials) else 0
 
     def __repr__(self) -> str:
