@@ -26,7 +26,7 @@ from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices
-from policies.envs.runners import Runners
+from policies.envs.together import stepper_of
 from policies.errors import EnvError, SpecError
 
 EndedBy = Literal["terminated", "truncated", "cap"]
@@ -112,8 +112,8 @@ class Evaluator:
         self._classic = (
             None if self._cartpoles else RowsPlayer.make_if_classic(self._envs[0], env_id, self.env_args, self.seeds)
         )
-        runners = Runners.of(env_id, self.env_args)
-        self._runners = None if runners is None else calls.watch_steps(runners)
+        stepper = stepper_of(env_id, self.env_args)
+        self._stepper = None if stepper is None else calls.watch_steps(stepper)
 
     @property
     def starts(self) -> Starts | None:
@@ -162,8 +162,8 @@ class Evaluator:
             close_env(env)
         if self._classic is not None:
             self._classic.close()
-        if self._runners is not None:
-            self._runners.close()
+        if self._stepper is not None:
+            self._stepper.close()
 
     def __enter__(self) -> Self:
         return self
@@ -194,8 +194,8 @@ class Evaluator:
     def _step(self, policy: Policy, running: Sequence[Running], actions: Any) -> list[bool]:
         """Step episodes and return which of them have ended."""
         # Another may give actions of other types or outside of their bounds, which is the environment's to judge.
-        if self._runners is not None and type(policy) is NetworkPolicy:
-            return step_together(self._runners, running, actions)
+        if self._stepper is not None and type(policy) is NetworkPolicy:
+            return step_together(self._stepper, running, actions)
         return [episode.step(action) for episode, action in zip(running, actions, strict=True)]
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.envs.checked import check_observation, check_reward, is_sound, reward_as_number
+from policies.envs.copies import Stepper
 from policies.envs.faults import env_failed
-from policies.envs.runners import Copy, Runners
 from policies.errors import EnvFailedError
 
 
@@ -24,7 +24,7 @@ class Running:
         self.length = 0
         self.total = 0.0
         self.has_terminated = False
-        self.copy: Copy | None = None
+        self.copy: Any = None
         self._space = env.observation_space
         try:
             observation, _ = env.reset(seed=seed)
@@ -90,13 +90,13 @@ class Running:
         )
 
 
-def step_together(runners: Runners, episodes: Sequence[Running], actions: NDArray[np.float32]) -> list[bool]:
-    """Step episodes of a running robot at once, as each one's `step` would, and return which of them have ended."""
+def step_together(stepper: Stepper, episodes: Sequence[Running], actions: NDArray[Any]) -> list[bool]:
+    """Step episodes together, as each one's `step` would, and return which of them have ended."""
     copies = []
     for episode in episodes:
-        episode.copy = episode.copy or Copy(episode.env)
+        episode.copy = episode.copy or stepper.copy_of(episode.env)
         copies.append(episode.copy)
-    stepped = runners.step(copies, actions)
+    stepped = stepper.step(copies, actions)
     ended = []
     for place, episode in enumerate(episodes):
         if (failure := stepped.failures.get(place)) is not None:
@@ -104,5 +104,5 @@ def step_together(runners: Runners, episodes: Sequence[Running], actions: NDArra
         episode.length += 1
         episode.take(stepped.observations[place], float(stepped.rewards[place]))
         episode.has_terminated = bool(stepped.terminated[place])
-        ended.append(episode.has_terminated or episode.length == runners.limit)
+        ended.append(episode.has_terminated or episode.length == stepper.limit)
     return ended

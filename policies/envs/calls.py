@@ -151,9 +151,9 @@ def watch_rows(rows: _Watched) -> _Watched:
     return _watch(rows, {"start": Call.RESET, "step": Call.STEP})
 
 
-def watch_steps(runners: _Watched) -> _Watched:
+def watch_steps(stepper: _Watched) -> _Watched:
     """Have what steps several environments at once write its steps to the page, if this process is watched."""
-    return _watch(runners, {"step": Call.STEP})
+    return _watch(stepper, {"step": Call.STEP})
 
 
 def watch_policy(policy: _Watched) -> _Watched:

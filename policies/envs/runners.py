@@ -9,29 +9,19 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.copies import CopiesStep
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.plain import is_plain
 
 _MODULE = "gymnasium.envs.mujoco."
 _COMPARED_STEPS = 60
-
-
-class RunnersStep(NamedTuple):
-    """What a step of some copies gives; no later step changes the arrays."""
-
-    observations: NDArray[np.float64]
-    """Shape (num, n)."""
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    failures: dict[int, Exception]
-    """What MuJoCo raised, by the number of the copy, whose other results mean nothing."""
 
 
 class Copy:
@@ -79,7 +69,7 @@ _ENTRY_POINTS = {f"{_MODULE}{name.replace('.', ':')}" for name in _RUNNERS}
 
 
 class Runners:
-    """Steps copies of one environment, all of which have its arguments.
+    """Steps copies of one environment, all of which have its arguments; see `policies.envs.copies.Stepper`.
 
     Args:
         env: One of them, which tells its numbers; it is not stepped.
@@ -117,7 +107,11 @@ class Runners:
             close_env(env)
         return found
 
-    def step(self, copies: Sequence[Copy], actions: NDArray[np.float32]) -> RunnersStep:
+    def copy_of(self, env: gym.Env[Any, Any]) -> Copy:
+        """Return what `step` takes for an environment of its own, over all its episodes."""
+        return Copy(env)
+
+    def step(self, copies: Sequence[Copy], actions: NDArray[np.float32]) -> CopiesStep:
         """Step copies, of which there is at least one; they never reset by themselves.
 
         Args:
@@ -147,7 +141,7 @@ class Runners:
             rewards = forward + healthy * args["_healthy_reward"] - cost
             terminated = ~healthy & bool(args["_terminate_when_unhealthy"])
             np.clip(qvel, -10, 10, out=qvel)
-        return RunnersStep(np.concatenate([qpos[:, self._skipped :], qvel], axis=1), rewards, terminated, failures)
+        return CopiesStep(np.concatenate([qpos[:, self._skipped :], qvel], axis=1), rewards, terminated, failures)
 
     def close(self) -> None:
         """Close the environment that tells its numbers."""

@@ -14,9 +14,10 @@ from policies.acting.policy import NetworkPolicy
 from policies.envs.make import make_env
 from policies.envs.runners import Copy, Runners
 from policies.packed.envs.make import make_packed_envs
-from policies.packed.envs.runner_sub_envs import RunnerSubEnvs, make_sub_envs
-from policies.packed.envs.sub_envs import SubEnvs, SubStep
+from policies.packed.envs.sub_envs import SubEnvs
+from policies.packed.envs.together_sub_envs import TogetherSubEnvs, make_sub_envs
 from policies.portable.file import Layer, PolicyNetwork, PortablePolicy, describe_space
+from tests.sub_steps import assert_equal_steps
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -40,21 +41,12 @@ def _warnings_as_they_were() -> Iterator[None]:
     mujoco.set_mju_user_warning(before)
 
 
-def assert_equal_steps(ours: SubStep, theirs: SubStep) -> None:
-    for name in ("final_observations", "rewards", "terminated", "truncated"):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name, strict=True)
-    assert list(ours.first_observations) == list(theirs.first_observations)
-    for place, first in theirs.first_observations.items():
-        np.testing.assert_array_equal(ours.first_observations[place], first, strict=True)
-    assert ours.errors.keys() == theirs.errors.keys()
-
-
 @pytest.mark.parametrize(("env_id", "args"), ROBOTS)
 def test_each_step_is_gymnasiums_to_the_last_bit(env_id: str, args: dict[str, Any]) -> None:
     """Through falls and time limits, while members come and go."""
     args = {**args, "max_episode_steps": 25}
     ours, theirs = make_sub_envs(env_id, args), SubEnvs(env_id, args)
-    assert isinstance(ours, RunnerSubEnvs)
+    assert isinstance(ours, TogetherSubEnvs)
     space = make_env(env_id, args).action_space
     assert isinstance(space, gym.spaces.Box)
     rng = np.random.default_rng(1)
@@ -186,18 +178,19 @@ def test_a_gymnasium_that_steps_in_another_way_is_left_to_itself(name: str, monk
 
 def test_what_mujoco_raises_is_the_error_of_that_member(monkeypatch: pytest.MonkeyPatch) -> None:
     envs = make_sub_envs("Hopper-v5", {})
-    assert isinstance(envs, RunnerSubEnvs)
+    assert isinstance(envs, TogetherSubEnvs)
     for name in ("good", "bad", "fine"):
         envs.add(name, [1, 2])
     broken = envs._copies[3].data
-    step = envs._runners._mj_step
+    runners: Any = envs._stepper
+    step = runners._mj_step
 
     def fails(model: Any, data: Any, num: int) -> None:
         if data is broken:
             raise mujoco.FatalError("mj_stack overflow")
         step(model, data, num)
 
-    monkeypatch.setattr(envs._runners, "_mj_step", fails)
+    monkeypatch.setattr(runners, "_mj_step", fails)
     stepped = envs.step(np.zeros((6, 3), dtype=np.float32))
     assert list(stepped.errors) == ["bad"]
     assert "mj_stack overflow" in str(stepped.errors["bad"])
@@ -207,7 +200,7 @@ def test_what_mujoco_raises_is_the_error_of_that_member(monkeypatch: pytest.Monk
 
 def test_an_observation_that_is_not_finite_is_the_error_of_that_member() -> None:
     envs = make_sub_envs("HalfCheetah-v5", {})
-    assert isinstance(envs, RunnerSubEnvs)
+    assert isinstance(envs, TogetherSubEnvs)
     for name in ("good", "bad"):
         envs.add(name, [1])
     actions = np.zeros((2, 6), dtype=np.float32)

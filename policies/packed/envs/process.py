@@ -17,8 +17,8 @@ from policies.child_processes import entry
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules, allowed_modules
 from policies.errors import EnvError
-from policies.packed.envs.runner_sub_envs import make_sub_envs
 from policies.packed.envs.sub_envs import HostDiedError, SubEnvs
+from policies.packed.envs.together_sub_envs import make_sub_envs
 from policies.parents import end_with_parent
 
 _PATIENCE_S = 5.0

@@ -24,8 +24,8 @@ from policies.packed.envs.classic_sub_envs import ClassicSubEnvs
 from policies.packed.envs.penalty import Penalty
 from policies.packed.envs.process import ProcessHost
 from policies.packed.envs.rows import MemberRows, Rows
-from policies.packed.envs.runner_sub_envs import make_sub_envs
 from policies.packed.envs.sub_envs import HereHost, Host, HostDiedError, SubStep
+from policies.packed.envs.together_sub_envs import make_sub_envs
 from policies.packed.envs.vector import Step
 
 _NUM_SEEDS = 2**32  # Gymnasium takes larger seeds, but many environments do not

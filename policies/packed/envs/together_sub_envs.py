@@ -1,4 +1,4 @@
-"""Step MuJoCo's running robots for members of a pack together, as a loop over their environments would."""
+"""Step environments of a pack's members together where there is a way, as a loop over them would."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from policies.envs.checked import is_sound
-from policies.envs.runners import Copy, Runners
+from policies.envs.copies import Stepper
+from policies.envs.together import stepper_of
 from policies.errors import EnvError
 from policies.packed.envs.game_sub_envs import GameSubEnvs
 from policies.packed.envs.sub_envs import SubEnvs, SubStep, find_unsound
@@ -26,39 +27,39 @@ def make_sub_envs(env_id: str, env_args: Mapping[str, Any] | None, *, with_lives
     """
     if with_lives:
         return GameSubEnvs(env_id, env_args)
-    runners = Runners.of(env_id, env_args)
-    return SubEnvs(env_id, env_args) if runners is None else RunnerSubEnvs(env_id, env_args, runners)
+    stepper = stepper_of(env_id, env_args)
+    return SubEnvs(env_id, env_args) if stepper is None else TogetherSubEnvs(env_id, env_args, stepper)
 
 
-class RunnerSubEnvs(SubEnvs):
-    """`SubEnvs` of a running robot: seeds, episodes and errors are the same, to the last bit.
+class TogetherSubEnvs(SubEnvs):
+    """`SubEnvs` that are stepped together: seeds, episodes and errors are the same, to the last bit.
 
     Args:
         env_id: Gymnasium id.
         env_args: The same as for `policies.envs.make.make_env`.
-        runners: Steps them; it belongs to this object from here on.
+        stepper: Steps them; it belongs to this object from here on.
     """
 
-    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None, runners: Runners) -> None:
+    def __init__(self, env_id: str, env_args: Mapping[str, Any] | None, stepper: Stepper) -> None:
         super().__init__(env_id, env_args)
-        self._runners = runners
-        self._copies: list[Copy] = []
+        self._stepper = stepper
+        self._copies: list[Any] = []
 
     @override
     def add(self, member_id: str, seeds: Sequence[int]) -> list[NDArray[Any]]:
         observations = super().add(member_id, seeds)
-        self._copies += [Copy(one.env) for one in self._envs[len(self._copies) :]]
+        self._copies += [self._stepper.copy_of(one.env) for one in self._envs[len(self._copies) :]]
         return observations
 
     @override
     def remove(self, member_id: str) -> None:
         super().remove(member_id)
-        self._copies = [Copy(one.env) for one in self._envs]
+        self._copies = [self._stepper.copy_of(one.env) for one in self._envs]
 
     @override
     def step(self, actions: NDArray[Any]) -> SubStep:
-        envs, limit = self._envs, self._runners.limit
-        stepped = self._runners.step(self._copies, actions)
+        envs, limit = self._envs, self._stepper.limit
+        stepped = self._stepper.step(self._copies, actions)
         for one in envs:
             one.num_steps += 1
         lengths = [one.num_steps for one in envs]
@@ -84,4 +85,4 @@ class RunnerSubEnvs(SubEnvs):
     @override
     def close(self) -> None:
         super().close()
-        self._runners.close()
+        self._stepper.close()
