@@ -19,11 +19,15 @@ _ENVIRONMENT = {
     "RAY_AIR_NEW_OUTPUT": "0",
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
 }
+# Read by a Ray that is started here, unless the user says otherwise. By Ray's own default of 15 its processes get 3 %
+# of a core beside anything else that runs there. Those that are forked have none of it.
+_NICENESS = "RAY_worker_niceness", "0"
 
 
 def prepare_environment() -> None:
-    """Set the variables that Ray Tune reads; call it before Ray starts, so that its workers inherit them."""
+    """Set the variables that Ray and Ray Tune read; call it before Ray starts, so that its workers inherit them."""
     os.environ.update(_ENVIRONMENT)
+    os.environ.setdefault(*_NICENESS)
 
 
 def provide_token() -> None:
