@@ -2,7 +2,7 @@
 
 Box2D's own steps are made one copy after another, as they have to be. What Gymnasium computes around each is computed
 in Python's numbers, each expression as it stands there, and what a step has left is not asked for again: the results
-are those of Gymnasium's environments to the last bit. The half of an env step's time was spent there.
+are those of Gymnasium's environments to the last bit. Half of an env step's time was spent there.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _Numbers:
         self.side_power = module.SIDE_ENGINE_POWER
 
 
-class _Landed(NamedTuple):
+class _Stepped(NamedTuple):
     state: tuple[float, ...]
     reward: float
     terminated: bool
@@ -57,7 +57,7 @@ class _Lander:
         self._lander: Any = None
         self._x = self._y = self._angle = 0.0
 
-    def step(self, main: float, side: float, direction: float) -> _Landed:
+    def step(self, main: float, side: float, direction: float) -> _Stepped:
         """Step once.
 
         Args:
@@ -86,9 +86,9 @@ class _Lander:
             power = numbers.main_power
             lander.ApplyLinearImpulse((-ox * power * main, -oy * power * main), (x + ox, y + oy), True)  # noqa: FBT003 (Box2D's C function)
         if side:
-            across = 3 * second + direction * numbers.side_away / scale
-            ox = sine * first + -cosine * across
-            oy = -cosine * first - sine * across
+            aside = 3 * second + direction * numbers.side_away / scale
+            ox = sine * first + -cosine * aside
+            oy = -cosine * first - sine * aside
             power = numbers.side_power
             # Gymnasium's own number for the height, which is another one than its engines'.
             at = (x + ox - sine * 17 / scale, y + oy + cosine * numbers.side_height / scale)
@@ -119,7 +119,7 @@ class _Lander:
             terminated, reward = True, 100.0
         turning = 20.0 * lander.angularVelocity / numbers.fps
         state = (across, above, speed_x, speed_y, angle, turning, left_down, right_down)
-        return _Landed(state, reward, terminated)
+        return _Stepped(state, reward, terminated)
 
 
 class Landers:

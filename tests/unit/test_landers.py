@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from policies.acting.evaluate import Evaluator, play_episode
-from policies.acting.policy import NetworkPolicy
 from policies.envs.landers import Landers, _is_lander
 from policies.envs.make import make_env
 from policies.packed.envs.make import make_packed_envs
 from policies.packed.envs.sub_envs import SubEnvs
 from policies.packed.envs.together_sub_envs import TogetherSubEnvs, make_sub_envs
-from policies.portable.file import Layer, PolicyNetwork, PortablePolicy, describe_space
-from tests.sub_steps import assert_equal_steps
+from tests.stepped_together import assert_equal_steps, check_episodes
 
 pytest.importorskip("Box2D")
 lunar_lander: Any = importlib.import_module("gymnasium.envs.box2d.lunar_lander")
@@ -183,45 +180,9 @@ def test_what_box2d_raises_is_the_error_of_that_member() -> None:
     assert np.isfinite(stepped.rewards[[0, 1, 4, 5]]).all()
 
 
-def policy_of(env_id: str, args: dict[str, Any], seed: int) -> NetworkPolicy:
-    env = make_env(env_id, args)
-    is_continuous = isinstance(env.action_space, gym.spaces.Box)
-    rng = np.random.default_rng(seed)
-
-    def weights(*shape: int) -> NDArray[np.float32]:
-        return rng.normal(0, 0.5, shape).astype(np.float32)
-
-    layers = (Layer(weights(16, 8), weights(16), "tanh"), Layer(weights(4, 16), weights(4), "linear"))
-    return NetworkPolicy(
-        PortablePolicy(
-            network=PolicyNetwork("gaussian" if is_continuous else "categorical", layers),
-            algorithm="ppo",
-            env_id=env_id,
-            env_args=args,
-            observation_space=describe_space(env.observation_space),
-            action_space=describe_space(env.action_space),
-            action_transform="unsquash" if is_continuous else "none",
-            training={},
-        )
-    )
-
-
 @pytest.mark.parametrize("env_id", ["LunarLander-v3", "LunarLanderContinuous-v3"])
 def test_episodes_of_an_evaluation_are_those_that_are_played_alone(
     env_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    args, seeds = {"max_episode_steps": 150}, list(range(20))
-    policy = policy_of(env_id, args, 3)
-    alone = [play_episode(policy, make_env(env_id, args), seed, max_episode_steps=130) for seed in seeds]
-    for cap in (130, 200, None):
-        with Evaluator(env_id, args, seeds, max_episode_steps=cap) as evaluator:
-            for env in evaluator._envs:
-                monkeypatch.setattr(env, "step", None)  # it is not called
-            episodes = evaluator.run(policy)
-            again = evaluator.run(policy)
-        assert episodes == again
-        if cap == 130:
-            assert list(zip(episodes.returns, episodes.lengths, strict=True)) == alone
-            assert len(set(episodes.lengths)) > 1
-        else:
-            assert max(episodes.lengths) <= 150
+    lengths = check_episodes(env_id, monkeypatch, cap=130, limit=150)
+    assert len(set(lengths)) > 1

@@ -7,17 +7,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from policies.acting.evaluate import Evaluator, play_episode
-from policies.acting.policy import NetworkPolicy
 from policies.envs.make import make_env
 from policies.envs.runners import Copy, Runners
 from policies.packed.envs.make import make_packed_envs
 from policies.packed.envs.sub_envs import SubEnvs
 from policies.packed.envs.together_sub_envs import TogetherSubEnvs, make_sub_envs
-from policies.portable.file import Layer, PolicyNetwork, PortablePolicy, describe_space
-from tests.sub_steps import assert_equal_steps
+from tests.stepped_together import assert_equal_steps, check_episodes
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -213,53 +209,11 @@ def test_an_observation_that_is_not_finite_is_the_error_of_that_member() -> None
     assert str(ours.errors["bad"]) == str(other.errors["bad"])
 
 
-def policy_of(env_id: str, args: dict[str, Any], seed: int) -> NetworkPolicy:
-    env = make_env(env_id, args)
-    space, action_space = env.observation_space, env.action_space
-    assert isinstance(space, gym.spaces.Box)
-    assert isinstance(action_space, gym.spaces.Box)
-    rng = np.random.default_rng(seed)
-
-    def weights(*shape: int) -> NDArray[np.float32]:
-        return rng.normal(0, 0.5, shape).astype(np.float32)
-
-    num = 2 * action_space.shape[0]
-    layers = (
-        Layer(weights(16, space.shape[0]), weights(16), "tanh"),
-        Layer(weights(num, 16), weights(num), "linear"),
-    )
-    return NetworkPolicy(
-        PortablePolicy(
-            network=PolicyNetwork("gaussian", layers),
-            algorithm="ppo",
-            env_id=env_id,
-            env_args=args,
-            observation_space=describe_space(space),
-            action_space=describe_space(action_space),
-            action_transform="unsquash",
-            training={},
-        )
-    )
-
-
 @pytest.mark.parametrize("env_id", ["Hopper-v5", "HalfCheetah-v5"])
 def test_episodes_of_an_evaluation_are_those_that_are_played_alone(
     env_id: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    args, seeds = {"max_episode_steps": 60}, list(range(20))
-    policy = policy_of(env_id, args, 3)
-    alone = [play_episode(policy, make_env(env_id, args), seed, max_episode_steps=50) for seed in seeds]
-    for cap in (50, 100, None):
-        with Evaluator(env_id, args, seeds, max_episode_steps=cap) as evaluator:
-            for env in evaluator._envs:
-                monkeypatch.setattr(env, "step", None)  # it is not called
-            episodes = evaluator.run(policy)
-            again = evaluator.run(policy)
-        assert episodes == again
-        if cap == 50:
-            assert list(zip(episodes.returns, episodes.lengths, strict=True)) == alone
-        else:
-            assert max(episodes.lengths) <= 60
+    check_episodes(env_id, monkeypatch, cap=50, limit=60)
 
 
 def test_mujoco_says_each_warning_once_and_writes_no_file(

@@ -200,7 +200,8 @@ def test_what_a_process_has_set_for_arriving_signals_stays() -> None:
     """As an event loop that handles signals does; then one is known when its handler is called."""
     reading, writing = os.pipe()
     try:
-        os.set_blocking(writing, False)
+        for end in (reading, writing):
+            os.set_blocking(end, False)
         signal.set_wakeup_fd(writing)
         with taking_signals() as interruption:
             assert not interruption.has_arrived()
