@@ -174,6 +174,8 @@ def make_env(
             raise EnvError(f"{env_id} observes pixels, so it cannot have the render mode {render_mode!r}.", "Use none.")
         render_mode = _prepare_pixels(env_id, spec)
     if render_mode is not None:
+        # Here the module of the env is imported, and with it what it draws with.
+        draw_without_display()
         kwargs["render_mode"] = render_mode
     try:
         with calls.inside(Call.CONSTRUCTOR):

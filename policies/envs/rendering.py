@@ -3,13 +3,54 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
+from functools import cache
+
+_MUJOCO_GL = "MUJOCO_GL"
+_MUJOCO_BACKENDS = ("egl", "osmesa")
+"""What MuJoCo draws with in memory, on a GPU if there is one, then on CPUs."""
+_TRIAL_TIMEOUT_S = 30.0
 
 
 def draw_without_display() -> None:
-    """Let pygame draw into memory if this machine has no display; call it before making an environment that draws."""
+    """Let pygame and MuJoCo draw into memory if this machine has no display; call it before an env that draws is made.
+
+    MuJoCo's part is done once the process has imported it: whoever draws nothing of it need not wait for a trial of its
+    libraries, which takes half a second.
+    """
     # Otherwise pygame prints a greeting on standard output and connects to a display.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+    if "mujoco" in sys.modules and _MUJOCO_GL not in os.environ and (name := _mujoco_backend()) is not None:
+        os.environ[_MUJOCO_GL] = name
+
+
+@cache
+def _mujoco_backend() -> str | None:
+    """Return the first of the backends that draws on this machine; None: none does.
+
+    Gymnasium tries a window first, and takes one that could not be opened for an open one: its next attempts are never
+    made. A library that is there may still find no device, and what was imported for one backend can't be taken back
+    for another; so each is tried in a process of its own.
+    """
+    return next((name for name in _MUJOCO_BACKENDS if _draws(name)), None)
+
+
+def _draws(backend: str) -> bool:
+    code = f"from mujoco.{backend} import GLContext; GLContext(8, 8).make_current()"
+    try:
+        done = subprocess.run(  # noqa: S603  (a fixed command)
+            [sys.executable, "-c", code],
+            env={**os.environ, _MUJOCO_GL: backend},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            check=False,
+            timeout=_TRIAL_TIMEOUT_S,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.returncode == 0

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from policies.envs import rendering
+from policies.envs.rendering import draw_without_display
+
+VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "SDL_AUDIODRIVER", "MUJOCO_GL")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only on Linux are there machines without a display")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_known_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for name in VARIABLES:
+        # Set first, so that what a test leaves behind is taken away.
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    rendering._mujoco_backend.cache_clear()
+    yield
+    rendering._mujoco_backend.cache_clear()
+
+
+def draw_where(monkeypatch: pytest.MonkeyPatch, *backends: str, imported: bool = True) -> list[str]:
+    """Prepare to draw where these backends work, and return which ones were tried."""
+    tried: list[str] = []
+
+    def draws(backend: str) -> bool:
+        tried.append(backend)
+        return backend in backends
+
+    monkeypatch.setattr(rendering, "_draws", draws)
+    if imported:
+        monkeypatch.setitem(sys.modules, "mujoco", types.ModuleType("mujoco"))
+    else:
+        monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    draw_without_display()
+    return tried
+
+
+@pytest.mark.parametrize(
+    ("working", "chosen", "tried"),
+    [
+        (["egl", "osmesa"], "egl", ["egl"]),
+        (["osmesa"], "osmesa", ["egl", "osmesa"]),
+        # What MuJoCo says then names what is missing.
+        ([], None, ["egl", "osmesa"]),
+    ],
+)
+def test_without_a_display_mujoco_draws_with_the_first_that_works(
+    monkeypatch: pytest.MonkeyPatch, working: list[str], chosen: str | None, tried: list[str]
+) -> None:
+    assert draw_where(monkeypatch, *working) == tried
+    assert os.environ.get("MUJOCO_GL") == chosen
+    draw_without_display()
+    assert os.environ.get("MUJOCO_GL") == chosen
+
+
+def test_what_works_is_looked_for_once_in_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = draw_where(monkeypatch)
+    draw_without_display()
+    assert tried == ["egl", "osmesa"]
+
+
+@pytest.mark.parametrize("name", ["DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"])
+def test_what_the_user_has_set_stays(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv(name, "glfw")
+    assert draw_where(monkeypatch, "egl") == []
+    assert os.environ.get("MUJOCO_GL") == ("glfw" if name == "MUJOCO_GL" else None)
+    assert os.environ.get("SDL_VIDEODRIVER") == ("dummy" if name == "MUJOCO_GL" else None)
+
+
+def test_who_draws_no_robot_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert draw_where(monkeypatch, "egl", imported=False) == []
+    assert "MUJOCO_GL" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("program", "draws"),
+    [
+        ("import sys; sys.exit(0)", True),
+        ("raise ImportError('no device')", False),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", False),
+        ("import time; time.sleep(60)", False),
+    ],
+)
+def test_a_library_that_fails_crashes_or_hangs_does_not_draw(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, program: str, draws: bool
+) -> None:
+    package = tmp_path / "mujoco" / "egl"
+    package.mkdir(parents=True)
+    (tmp_path / "mujoco" / "__init__.py").touch()
+    lines = [
+        "import os",
+        "class GLContext:",
+        "    def __init__(self, width: int, height: int) -> None: pass",
+        "    def make_current(self) -> None: assert os.environ['MUJOCO_GL'] == 'egl'",
+        program,
+    ]
+    (package / "__init__.py").write_text("\n".join(lines) + "\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    if "sleep" in program:
+        monkeypatch.setattr(rendering, "_TRIAL_TIMEOUT_S", 1.0)
+    assert rendering._draws("egl") is draws
+
+
+def test_a_robot_is_drawn_without_a_display_and_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mujoco")
+    if rendering._mujoco_backend() is None:
+        pytest.skip("neither EGL nor OSMesa draws here")
+    # In a process of its own: in this one MuJoCo's libraries may be loaded for another way to draw.
+    program = """
+from policies.envs.make import make_env
+
+env = make_env("Hopper-v5", render_mode="rgb_array")
+env.reset(seed=0)
+picture = env.render()
+print(picture.shape, picture.std() > 10)
+env.close()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("(480, 480, 3) True\n", "")
