@@ -34,7 +34,8 @@ EndedBy = Literal["terminated", "truncated", "cap"]
 
 MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
-_MAX_ENVS = 16
+MAX_ENVS = 16
+"""The most environments that are open at once, so that networks get batches."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class Evaluator:
         seeds: One episode is played for each, in this order; none may be negative.
         max_episode_steps: Cap on the env steps of an episode; None: the env's time limit, or 10,000 if it has
             none.
+        max_envs: The most environments that are open at once.
 
     Raises:
         EnvError: The environment cannot be made.
@@ -103,7 +105,9 @@ class Evaluator:
         seeds: Sequence[int],
         *,
         max_episode_steps: int | None = None,
+        max_envs: int = MAX_ENVS,
     ) -> None:
+        self._max_envs = max_envs
         self.seeds = check_seeds(seeds)
         self.env_id, self.env_args = env_id, dict(env_args or {})
         self._envs = [make_env(env_id, self.env_args)]
@@ -176,7 +180,7 @@ class Evaluator:
 
     def _play_side_by_side(self, policy: Policy) -> list[tuple[float, int]]:
         """Play in several envs at once, so that the network gets batches; an env that is free takes the next seed."""
-        while len(self._envs) < min(len(self.seeds), _MAX_ENVS):
+        while len(self._envs) < min(len(self.seeds), self._max_envs):
             self._envs.append(make_env(self.env_id, self.env_args))
         waiting = deque(enumerate(self.seeds))
         results: dict[int, tuple[float, int]] = {}

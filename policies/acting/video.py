@@ -192,7 +192,8 @@ class _Stage:
         except Exception as error:  # an env may raise anything
             raise EnvError(
                 f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
-                "Install what it needs to draw without a display (MuJoCo: EGL or OSMesa, libegl1 or libosmesa6 of Debian).",
+                "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
+                "libosmesa6).",
             ) from error
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
             raise EnvError(

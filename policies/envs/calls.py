@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 PAGE_BYTES = 64
-_COUNT, _CALL, _STEPS = range(3)
+_COUNT, _CALL, _STEPS, _RESETS = range(4)
 _Watched = TypeVar("_Watched")
 
 
@@ -74,6 +74,11 @@ class Page:
         """Steps since its last reset of the environment stepped last, including a step that still runs."""
         return self._cells[_STEPS]
 
+    @property
+    def resets(self) -> int:
+        """How often environments have been reset so far."""
+        return self._cells[_RESETS]
+
     @contextlib.contextmanager
     def inside(self, call: Call) -> Iterator[None]:
         """Mark the block as a call of this kind."""
@@ -110,6 +115,7 @@ class Page:
                 cells[_STEPS] = steps[0]
             elif call == _RESET:
                 steps[0] = 0
+                cells[_RESETS] += 1
             try:
                 return method(*args, **kwargs)
             except BaseException:

@@ -147,31 +147,27 @@ def measure_step(env_id: str, env_args: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluate_policy(
-    env_id: str, env_args: dict[str, Any], policy: dict[str, str], seeds: Sequence[int], max_episode_steps: int | None
+    env_id: str, env_args: dict[str, Any], policy: dict[str, str], seeds: Sequence[int], **options: Any
 ) -> dict[str, Any]:
-    """Run `policies.acting.evaluate.evaluate_policy` with a saved policy and return the episodes."""
-    from policies.acting.evaluate import evaluate_policy as evaluate
+    """Play the episodes of an `Evaluator` with these options with a saved policy, and return them."""
+    from policies.acting.evaluate import Evaluator
 
-    return vars(
-        evaluate(
-            _load(policy), env_id=env_id, env_args=env_args, seeds=seeds, max_episode_steps=max_episode_steps
-        )
-    )  # fmt: skip
+    with Evaluator(env_id, env_args, seeds, **options) as evaluator:
+        return vars(evaluator.run(_load(policy)))
 
 
 def evaluate_policies(
-    env_id: str,
-    env_args: dict[str, Any],
-    policies: Sequence[dict[str, str]],
-    seeds: Sequence[int],
-    max_episode_steps: int | None,
+    env_id: str, env_args: dict[str, Any], policies: Sequence[dict[str, str]], seeds: Sequence[int], **options: Any
 ) -> list[dict[str, Any]]:
-    """Run `policies.packed.evaluation.evaluate_many` with saved policies; return their episodes, or their errors."""
+    """Run `policies.packed.evaluation.evaluate_many` with saved policies; return their episodes, or their errors.
+
+    The options are those of the `Evaluator`.
+    """
     from policies.acting.evaluate import Evaluator
     from policies.packed.evaluation import evaluate_many
 
     def play(some: list[Policy]) -> list[Episodes | Exception]:
-        with Evaluator(env_id, env_args, seeds, max_episode_steps=max_episode_steps) as evaluator:
+        with Evaluator(env_id, env_args, seeds, **options) as evaluator:
             return evaluate_many(evaluator, some)
 
     loaded = [_load(policy) for policy in policies]

@@ -20,7 +20,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 from multiprocessing.connection import Pipe
@@ -31,6 +31,7 @@ from policies.envs.calls import PAGE_BYTES, Call, Page
 from policies.envs.modules import ENVIRONMENT_VARIABLE, allowed_modules, module_folders
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from policies.files import absolute
+from policies.guard.failures import died, hung, place_of
 from policies.standard_streams import standard_streams
 
 CALL_TIMEOUT_S = 600.0
@@ -180,6 +181,16 @@ class EnvGuard:
 
     def __init__(self) -> None:
         self._child: _Child | None = None
+        self._others: list[EnvGuard] = []
+        self.episode_s: dict[str, float] = {}
+        """How long an episode takes in a child, in seconds, by what tells environments apart; see `spread`."""
+
+    def others(self, num: int) -> list[EnvGuard]:
+        """Return further guards, for jobs at the same time, whose children begin; they end with this one."""
+        self._others += [EnvGuard() for _ in range(num - len(self._others))]
+        for other in self._others[:num]:
+            other.start()
+        return self._others[:num]
 
     def start(self) -> None:
         """Start the child, if there is none, without waiting for it."""
@@ -187,7 +198,9 @@ class EnvGuard:
             self._child = _Child(_Surroundings.now())
 
     def close(self) -> None:
-        """End the child."""
+        """End the child, and those of further guards."""
+        for other in self._others:
+            other.close()
         if self._child is not None:
             child, self._child = self._child, None
             # Before its first job, the child has nothing to clean up.
@@ -200,7 +213,7 @@ class EnvGuard:
         self.close()
 
     def run(self, job: str, env_id: str, *, timeout_s: float = CALL_TIMEOUT_S, **arguments: Any) -> Any:
-        """Do a job in the child.
+        """Do a job in the child, and wait for it.
 
         Args:
             job: A function of `policies.guard.child`.
@@ -215,6 +228,30 @@ class EnvGuard:
             EnvFailedError: The environment hung, or ended the process.
             TuneJobsError: The function raised it.
         """
+        return self.begin(job, env_id, timeout_s=timeout_s, **arguments)()
+
+    @property
+    def num_resets(self) -> int:
+        """How often the child has reset environments so far."""
+        return 0 if self._child is None else self._child.page.resets
+
+    def begin(
+        self, job: str, env_id: str, *, timeout_s: float = CALL_TIMEOUT_S, look: Callable[[], None] = lambda: None,
+        **arguments: Any,
+    ) -> Callable[[], Any]:  # fmt: skip
+        """Begin a job in the child, whose result is waited for later.
+
+        Args:
+            job: As for `run`.
+            env_id: As for `run`.
+            timeout_s: As for `run`.
+            look: Called from time to time while the result is waited for.
+            arguments: As for `run`.
+
+        Returns:
+            What waits for the result, to be called before the next job begins. Until then nobody notices that the
+            environment hangs. It returns and raises what `run` does.
+        """
         child = self._ready_child()
         asked = {
             "job": job,
@@ -223,20 +260,35 @@ class EnvGuard:
             "module_folders": module_folders(),
             "arguments": {"env_id": env_id, **arguments},
         }
+        # That the child has ended is noticed when its answer is read.
+        with self._lost_if_it_fails(child), contextlib.suppress(OSError):
+            child.connection.send_bytes(json.dumps(asked).encode())
+
+        def result() -> Any:
+            with self._lost_if_it_fails(child):
+                answer = self._wait(child, env_id, timeout_s, look)
+            child.has_worked = True
+            if "error" in answer:
+                raise _error(answer["error"])
+            return answer["result"]
+
+        return result
+
+    def give_up(self) -> None:
+        """End the child whatever it does; the next job gets a new one."""
+        if self._child is not None:
+            child, self._child = self._child, None
+            child.close(patience_s=0.0)
+
+    @contextlib.contextmanager
+    def _lost_if_it_fails(self, child: _Child) -> Iterator[None]:
         try:
-            # That the child has ended is noticed when its answer is read.
-            with contextlib.suppress(OSError):
-                child.connection.send_bytes(json.dumps(asked).encode())
-            answer = self._wait(child, env_id, timeout_s)
+            yield
         except BaseException:
             # Also where this process is interrupted: nothing waits for the child any more then.
             self._child = None
             child.close(patience_s=0.0)
             raise
-        child.has_worked = True
-        if "error" in answer:
-            raise _error(answer["error"])
-        return answer["result"]
 
     def _ready_child(self) -> _Child:
         """Return a child with this process's present surroundings; a new one is started if they have changed."""
@@ -254,7 +306,7 @@ class EnvGuard:
         self._child.modules = modules
         return self._child
 
-    def _wait(self, child: _Child, env_id: str, timeout_s: float) -> Any:
+    def _wait(self, child: _Child, env_id: str, timeout_s: float, look: Callable[[], None]) -> Any:
         """Wait for the child's answer; the time limit begins anew with each sign of progress."""
         count, waited, before = child.page.count, 0.0, time.monotonic()
         while True:
@@ -265,6 +317,7 @@ class EnvGuard:
                     return json.loads(child.connection.recv_bytes())
             except (EOFError, OSError):
                 raise _died(child, env_id) from None
+            look()
             # Processes that the env has started may hold the pipe open after the child's end.
             if child.process.poll() is not None and not child.connection.poll():
                 raise _died(child, env_id)
@@ -279,46 +332,15 @@ class EnvGuard:
 
 def _hung(child: _Child, env_id: str, limit: float) -> EnvFailedError:
     # Read before the fault handler is asked, because its signal may wake a call that waits.
-    where = _where(child.page)
+    where = place_of(child.page)
     child.dump_frames()
-    return EnvFailedError(
-        f"{env_id} hangs in {where}: nothing came back for {limit:g} s{_shown(child.frames())}",
-        "Mend what it waits for, or set iteration_timeout_s higher if one call may take so long.",
-    )
+    return hung(env_id, where, limit, child.frames())
 
 
-def _died(child: _Child, env_id: str) -> TuneJobsError:
+def _died(child: _Child, env_id: str) -> EnvFailedError:
     with contextlib.suppress(subprocess.TimeoutExpired):
         child.process.wait(_PATIENCE_S)
-    code = child.process.returncode
-    how = "closed its connection" if code is None else f"ended with exit code {code}"
-    hint = "Mend the env: it must raise an error, not end the process that it runs in."
-    if child.page.call is Call.NONE:
-        hint = "See what it printed to standard error."
-    if code is not None and code < 0:
-        name, said = _signal_name(-code), (signal.strsignal(-code) or "").lower()
-        how = f"was ended by {name} ({said})" if said else f"was ended by {name}"
-        if -code == signal.SIGKILL:
-            hint = "Look at this machine's memory: the system ends processes that take too much."
-    return EnvFailedError(f"The process of {env_id} {how} in {_where(child.page)}{_shown(child.frames())}", hint)
-
-
-def _where(page: Page) -> str:
-    call = page.call
-    if call is Call.STEP and page.steps:
-        return f"{call.phrase}, step {page.steps} after reset()"
-    return call.phrase
-
-
-def _shown(frames: list[str]) -> str:
-    return ":\n" + "\n".join(f"  {frame}" for frame in frames) if frames else "."
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+    return died(env_id, child.page, child.process.returncode, child.frames())
 
 
 def _error(told: dict[str, str]) -> Exception:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from policies.envs.spaces import space_from_description
 from policies.errors import EnvError, TuneJobsError
 from policies.files import write_atomic, write_plain
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
+from policies.guard.spread import play_in_parts
 from policies.hyperparams import Algorithm, ConstantHyperparams, RandomHyperparams
 from policies.packed.envs.make import StepTime
 from policies.portable.file import PortablePolicy, save_policy
@@ -79,18 +80,29 @@ def evaluate_policy(
     env_args: Mapping[str, Any] | None = None,
     seeds: Sequence[int],
     max_episode_steps: int | None = None,
+    num_processes: int = 1,
+    told: Callable[[int], None] = lambda _: None,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> Episodes:
     """Run `policies.acting.evaluate.evaluate_policy` in the guard's child.
 
-    `timeout_s` is how long one call of the environment or of the policy may take.
+    Args:
+        policy: The policy that acts.
+        env_id: Gymnasium id.
+        env_args: Arguments of the env's constructor; None: none.
+        seeds: One episode is played for each, in this order.
+        max_episode_steps: As there.
+        num_processes: In how many processes at once slow environments are played at most.
+        told: Called from time to time with how many episodes have begun.
+        timeout_s: How long one call of the environment or of the policy may take.
     """
     with guarding() as guard, _saved(policy) as (saved,):
-        told = guard.run(
-            "evaluate_policy", env_id, env_args=_as_json(env_id, env_args), policy=saved,
-            seeds=[int(seed) for seed in seeds], max_episode_steps=max_episode_steps, timeout_s=timeout_s,
+        parts = play_in_parts(
+            guard, "evaluate_policy", env_id, [int(seed) for seed in seeds], num_policies=1,
+            num_processes=num_processes, env_args=_as_json(env_id, env_args), policy=saved,
+            max_episode_steps=max_episode_steps, timeout_s=timeout_s, told=told,
         )  # fmt: skip
-    return _episodes(told)
+    return _joined(parts)
 
 
 def evaluate_policies(
@@ -100,9 +112,13 @@ def evaluate_policies(
     env_args: Mapping[str, Any] | None = None,
     seeds: Sequence[int],
     max_episode_steps: int | None = None,
+    num_processes: int = 1,
+    told: Callable[[int], None] = lambda _: None,
     timeout_s: float = CALL_TIMEOUT_S,
 ) -> list[Episodes | TuneJobsError]:
     """Play one greedy episode for each seed and each policy, as many at once as the env allows, in the guard's child.
+
+    The arguments are those of `evaluate_policy`.
 
     Returns:
         For each policy its episodes, which are those of `evaluate_policy`, or the error that this would raise.
@@ -111,11 +127,12 @@ def evaluate_policies(
         EnvError: The environment cannot be made, hung, or ended its process, for whichever policy.
     """
     with guarding() as guard, _saved(*policies) as saved:
-        told = guard.run(
-            "evaluate_policies", env_id, env_args=_as_json(env_id, env_args), policies=saved,
-            seeds=[int(seed) for seed in seeds], max_episode_steps=max_episode_steps, timeout_s=timeout_s,
+        parts = play_in_parts(
+            guard, "evaluate_policies", env_id, [int(seed) for seed in seeds], num_policies=len(policies),
+            num_processes=num_processes, env_args=_as_json(env_id, env_args), policies=saved,
+            max_episode_steps=max_episode_steps, timeout_s=timeout_s, told=told,
         )  # fmt: skip
-    return [TuneJobsError(**each["error"]) if "error" in each else _episodes(each) for each in told]
+    return [_joined_or_error(of_policy) for of_policy in zip(*parts, strict=True)]
 
 
 def record_video(
@@ -198,6 +215,15 @@ def _told_better(env_id: str, error: EnvError) -> EnvError:
 
 def _episodes(told: Mapping[str, Any]) -> Episodes:
     return Episodes(**{name: tuple(values) for name, values in told.items()})
+
+
+def _joined(parts: Sequence[Mapping[str, Any]]) -> Episodes:
+    return _episodes({name: [value for part in parts for value in part[name]] for name in parts[0]})
+
+
+def _joined_or_error(parts: Sequence[Mapping[str, Any]]) -> Episodes | TuneJobsError:
+    error = next((part["error"] for part in parts if "error" in part), None)
+    return _joined(parts) if error is None else TuneJobsError(**error)
 
 
 @contextlib.contextmanager

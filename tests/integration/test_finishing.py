@@ -1,5 +1,6 @@
 """What comes after the trials, where the environment fails in it: said in the result, the report and the exit code."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -7,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -232,3 +233,21 @@ def test_a_plan_of_an_env_that_hangs_ends_with_a_message(tmp_path: Path, argumen
     assert done.returncode == 2, done.stderr
     assert words in json.loads(done.stdout)["error"]
     assert not (tmp_path / "here" / "sweep").exists()
+
+
+def test_it_is_shown_how_far_the_confirmation_is(
+    sweep_of: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("policies.guard.guard._LOOK_S", 0.01)
+    shown: dict[str, list[str]] = {}
+
+    @contextlib.contextmanager
+    def working(name: str, what: str, progress: str) -> Iterator[Callable[[str], None]]:
+        yield shown.setdefault(what, []).append
+
+    monkeypatch.setattr("tune_jobs.sweeps.live_view.working", working)
+    assert finished(sweep_of(step_s=0.0005)).exit_code == 0
+    numbers = [int(text.split()[-3]) for text in shown["choosing the best policy"] if text.startswith("confirming")]
+    assert numbers == sorted(numbers)
+    assert 1 <= numbers[0] < 20
+    assert 80 < numbers[-1] <= 100

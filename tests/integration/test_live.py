@@ -7,6 +7,7 @@ import pty
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any, cast
 
@@ -318,3 +319,36 @@ def test_on_a_terminal_finishing_is_shown_and_leaves_nothing() -> None:
     # The line is deleted at the end, and the cursor is shown again.
     assert rest.rfind(b"\x1b[2K") > rest.rfind(b"filming")
     assert rest.rfind(b"\x1b[?25h") >= 0
+
+
+SAYING = """
+import sys
+from tune_jobs.sweeps import live_view
+live_view._LINE_INTERVAL_S = 0.05
+with live_view.working("mine", "choosing the best policy", "auto") as say:
+    for line in sys.stdin:
+        say(line.strip())
+"""
+
+
+@pytest.mark.parametrize("on_terminal", [False, True])
+def test_what_finishing_does_now_takes_the_place_of_what_it_did(*, on_terminal: bool) -> None:
+    ours, theirs = pty.openpty() if on_terminal else os.pipe()
+    command = [sys.executable, "-c", SAYING]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=theirs, start_new_session=True) as process:
+        os.close(theirs)
+        assert process.stdin is not None
+        seen, until = b"", time.monotonic() + 60
+        while b"mine: choosing the best policy" not in seen:
+            seen += os.read(ours, 1_000)
+        process.stdin.write(b"confirming the best policy: episode 3 of 100\n")
+        process.stdin.flush()
+        while b"mine: confirming the best policy: episode 3 of 100" not in seen and time.monotonic() < until:
+            seen += os.read(ours, 1_000)
+        process.stdin.close()
+        with contextlib.suppress(OSError):  # the terminal's end, on Linux
+            while more := os.read(ours, 1_000):
+                seen += more
+    os.close(ours)
+    assert process.returncode == 0
+    assert -1 < seen.rfind(b"choosing") < seen.find(b"confirming")

@@ -1,6 +1,7 @@
 """The policy to deploy, chosen by more episodes among the checkpoints of all trials: real CartPole, made-up trials."""
 
 import dataclasses
+import itertools
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -325,3 +326,37 @@ def test_an_env_that_an_earlier_policy_broke_is_made_anew_for_the_next(hostile: 
 def test_an_env_that_ends_or_hangs_ends_them_all(hostile: Callable[..., Sequence[Any]], how: str, words: str) -> None:
     with pytest.raises(EnvFailedError, match=words):
         hostile(how=how, at=3)
+
+
+def test_all_is_played_with_the_cpus_that_there_are_and_tells_how_far_it_is(
+    make: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(finish, "cpus_for_episodes", {None: 3}.__getitem__)
+    asked: list[int] = []
+    said: list[str] = []
+
+    def noted(play: Callable[..., Any]) -> Callable[..., Any]:
+        def played(*args: Any, **kwargs: Any) -> Any:
+            asked.append(kwargs["num_processes"])
+            kwargs["told"](7)
+            return play(*args, **kwargs)
+
+        return played
+
+    monkeypatch.setattr(policy_choice, "evaluate_policies", noted(policy_choice.evaluate_policies))
+    monkeypatch.setattr(finish, "evaluate_policy", noted(finish.evaluate_policy))
+    best = finish.choose_best(make(LUCKY), 5, said.append)
+    # In each round, the winner's confirmation, the random policy's and that of the runners-up.
+    assert len(asked) >= present(best.choice).num_rounds + 3
+    assert set(asked) == {3}
+    phases = [list(group) for _, group in itertools.groupby(said, lambda text: text.split(":")[0])]
+    assert [group[0].split(":")[0] for group in phases] == [
+        "choosing the best policy", "confirming the best policy", "playing at random, to compare with it",
+        "confirming the runners-up",
+    ]  # fmt: skip
+    assert phases[0][0] == "choosing the best policy: 0 of at most 200,000 env steps; episode 4 of 4"
+    # The env steps of the rounds before.
+    assert len({text.split(";")[0] for text in phases[0]}) >= present(best.choice).num_rounds > 1
+    assert [group[0].split(": ")[1] for group in phases[1:]] == [
+        "episode 5 of 5", "episode 5 of 5", "episode 7 of 15",
+    ]  # fmt: skip

@@ -234,3 +234,34 @@ class VerySlow(Fragile):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         time.sleep(0.25)
         return super().step(action)
+
+
+class Patient(Fragile):
+    """Takes its time; what an episode gives depends on its seed and on the actions.
+
+    Args:
+        step_s: Seconds that a step takes.
+        pids: A file to which each object writes its process's id, when it is made.
+        broken: With this seed, what it does in its first step: `raise`, `exit`, or `hang`.
+        broken_seed: That seed.
+    """
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, step_s: float = 0.0, pids: str = os.devnull, broken: str = "", broken_seed: int = -1) -> None:
+        self.step_s, self.broken, self.broken_seed = step_s, broken, broken_seed
+        with open(pids, "a") as file:  # noqa: PTH123 (the null device too)
+            file.write(f"{os.getpid()}\n")
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.is_broken = seed == self.broken_seed
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        time.sleep(self.step_s)
+        if self.is_broken:
+            if self.broken == "hang":
+                time.sleep(3600)
+            return super().step({"raise": RAISE, "exit": EXIT}[self.broken])
+        observation, reward, *rest = super().step(0)
+        return observation, reward * (1 + int(action)), *rest

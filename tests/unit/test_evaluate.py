@@ -180,10 +180,9 @@ def test_an_evaluator_can_be_used_again_and_again() -> None:
     assert results[1] == by_hand(second, "CartPole-v0", range(12))
 
 
-def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policies.acting.evaluate, "_MAX_ENVS", 3)
+def test_other_envs_run_side_by_side_and_a_free_one_takes_the_next_seed() -> None:
     policy, seeds = make_policy("TestWalk-v0", seed=1), tuple(range(17))
-    with Evaluator("TestWalk-v0", {"end": 2.0}, seeds, max_episode_steps=300) as evaluator:
+    with Evaluator("TestWalk-v0", {"end": 2.0}, seeds, max_episode_steps=300, max_envs=3) as evaluator:
         result = evaluator.run(policy)
         assert len(evaluator._envs) == 3
         assert evaluator.run(policy) == result

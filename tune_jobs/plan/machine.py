@@ -62,7 +62,7 @@ def local_machine() -> Machine:
     """
     gpus = _visible_gpus()
     unusable = gpus if gpus and not uses_gpus() else 0.0
-    return Machine(_usable_cpus(), gpus - unusable, unusable_gpus=unusable, memory_bytes=_usable_memory())
+    return Machine(usable_cpus(), gpus - unusable, unusable_gpus=unusable, memory_bytes=_usable_memory())
 
 
 def _times(available: float, wanted: float) -> int:
@@ -70,7 +70,8 @@ def _times(available: float, wanted: float) -> int:
     return int(available) * math.floor(1 / wanted + 1e-9)
 
 
-def _usable_cpus() -> float:
+def usable_cpus() -> float:
+    """Return how many CPUs of this machine this process may use; a whole number, as Ray counts them."""
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     quota = _cgroup_quota(_CGROUPS)
     # Ray counts whole CPUs; half a CPU still runs one process.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,8 @@ from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.drawing import ReportMatter, videos_of
-from tune_jobs.sweeps.policy_choice import choose_policy, with_runners_up
+from tune_jobs.sweeps.drive import cpus_for_episodes
+from tune_jobs.sweeps.policy_choice import choose_policy, episode_of, with_runners_up
 from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.sources import find_sweep
 from tune_jobs.sweeps.storage import expanded, split_trial
@@ -45,8 +46,13 @@ _handed_out: list[Sweep] = []
 
 
 @guarding()
-def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
+def choose_best(store: Sweep, num_episodes: int = 100, say: Callable[[str], None] = lambda _: None) -> BestRecord:
     """Choose the policy to deploy, confirm it and the runners-up on seeds of their own, and copy it to best/.
+
+    Args:
+        store: The sweep.
+        num_episodes: On how many episodes it is confirmed.
+        say: Told what is done, as it begins and goes on.
 
     Raises:
         NoUsableTrialError: No trial can win; the message says why.
@@ -59,22 +65,30 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
         store.read_trials()
         spec = stored_spec(sweep)
         trials, results = read_trials(store), read_results(store)
-    chosen = choose_policy(store, spec, trials)
+    num_processes = cpus_for_episodes(sweep.address)
+    chosen = choose_policy(store, spec, trials, num_processes, say)
     winner = chosen.choice.winner
     seeds = confirmation_seeds(spec.seed, num_episodes)
     policy = policy_from_portable(chosen.policy, description=f"{store.name}/{chosen.trial.trial_id}")
     env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
     random = random_policy(env_id, env_args, timeout_s)
-    confirmation = run_evaluation(policy, env_id, env_args, seeds, timeout_s)
+
+    def played(policy: Policy, what: str) -> EvaluationRecord:
+        return run_evaluation(
+            policy, env_id, env_args, seeds, timeout_s, num_processes=num_processes,
+            told=lambda begun: say(f"{what}: {episode_of(begun, num_episodes)}"),
+        )  # fmt: skip
+
+    confirmation = played(policy, "confirming the best policy")
     record = BestRecord(
         checkpoint=winner.checkpoint,
         point=winner.point,
         seed=chosen.trial.seed,
         selection_score=winner.score,
         confirmation=confirmation,
-        random=run_evaluation(random, env_id, env_args, seeds, timeout_s),
+        random=played(random, "playing at random, to compare with it"),
         settings=judged(spec, trials, results, confirmation.threshold),
-        choice=with_runners_up(chosen, confirmation, timeout_s),
+        choice=with_runners_up(chosen, confirmation, timeout_s, num_processes, say),
     )
     store.write_best(record, chosen.policy)
     return record
@@ -82,10 +96,14 @@ def choose_best(store: Sweep, num_episodes: int = 100) -> BestRecord:
 
 @guarding()
 def run_evaluation(
-    policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int], timeout_s: float = CALL_TIMEOUT_S
-) -> EvaluationRecord:
-    """Play a policy's greedy episodes, one per seed; `timeout_s` is how long one call of the environment may take."""
-    episodes = evaluate_policy(policy, env_id=env_id, env_args=env_args, seeds=seeds, timeout_s=timeout_s)
+    policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int], timeout_s: float, *,
+    num_processes: int, told: Callable[[int], None] = lambda _: None,
+) -> EvaluationRecord:  # fmt: skip
+    """Play a policy's greedy episodes, one per seed; the arguments are those of `evaluate_policy`."""
+    episodes = evaluate_policy(
+        policy, env_id=env_id, env_args=env_args, seeds=seeds, timeout_s=timeout_s, num_processes=num_processes,
+        told=told,
+    )  # fmt: skip
     return EvaluationRecord(
         policy=policy.description,
         env_id=env_id,
@@ -194,8 +212,10 @@ def evaluate(
     first = FRESH_SEED if first_seed is None else first_seed
     seeds = range(first, first + num_episodes)
     env_id, env_args, timeout_s = source.env_id, source.env_args, source.timeout_s
-    record = run_evaluation(source.policy, env_id, env_args, seeds, timeout_s)
-    return record, run_evaluation(random_policy(env_id, env_args, timeout_s), env_id, env_args, seeds, timeout_s)
+    cpus = cpus_for_episodes(None)
+    record = run_evaluation(source.policy, env_id, env_args, seeds, timeout_s, num_processes=cpus)
+    random = random_policy(env_id, env_args, timeout_s)
+    return record, run_evaluation(random, env_id, env_args, seeds, timeout_s, num_processes=cpus)
 
 
 def _refuse_action(source: str, action: int | Sequence[float] | None) -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 from analysis.records import FINISHED, SweepRecord, SweepState
 from policies.errors import CannotRunError, TuneJobsError
 from tune_jobs.plan.engine_choice import PackPlan, may_pack
-from tune_jobs.plan.machine import Machine, local_machine
+from tune_jobs.plan.machine import Machine, local_machine, usable_cpus
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
 from tune_jobs.process.interruption import current
@@ -135,6 +135,19 @@ def machine_here() -> Machine:
         machine = connected_machine()
     most = _most_cpus.get()
     return machine if most is None or machine.num_cpus <= most else replace(machine, num_cpus=most, nodes=())
+
+
+def cpus_for_episodes(address: str | None) -> int:
+    """Return in how many processes of this machine what follows a sweep's trials may play at once.
+
+    Args:
+        address: The cluster that the sweep ran on; None: this machine. On a cluster's node it is one, as the others are
+            given to those who asked for them.
+    """
+    if address is not None:
+        return 1
+    most = _most_cpus.get()
+    return max(1, int(usable_cpus() if most is None else min(most, usable_cpus())))
 
 
 def address_of_users_ray() -> str | None:

@@ -74,8 +74,8 @@ class _Finish:
             if self.best is not None:
                 self.best = with_present_settings(store, self.best)
             else:
-                with self._working("confirming the best policy"):
-                    self.best = finish.choose_best(store)
+                with self._working("choosing the best policy") as say:
+                    self.best = finish.choose_best(store, say=say)
             self.artifacts["policy"] = store.best_policy_path
         except TuneJobsError as error:
             self._why = error
@@ -109,7 +109,7 @@ class _Finish:
 
         self._attempt("video", "filming the best policy", lambda: finish.make_videos(self._store))
 
-    def _working(self, doing: str) -> AbstractContextManager[None]:
+    def _working(self, doing: str) -> AbstractContextManager[Callable[[str], None]]:
         from tune_jobs.sweeps.live_view import working
 
         return working(self._store.name, doing, self._progress)

@@ -23,6 +23,9 @@ from tune_jobs.sweeps.notebook_view import WIDTH, NotebookView, kernel_shell
 _REFRESH_PER_S = 4
 _LINE_INTERVAL_S = 10.0
 
+Say = Callable[[str], None]
+"""Takes what is done now, such as "writing the report"."""
+
 _shares_terminal = False
 
 
@@ -100,8 +103,10 @@ def _view(monitor: SweepMonitor, stream: IO[str]) -> AbstractContextManager[obje
 
 
 @contextlib.contextmanager
-def working(name: str, what: str, progress: str) -> Iterator[None]:
+def working(name: str, what: str, progress: str) -> Iterator[Say]:
     """Show on standard error what is done after the trials while the block does it; nothing of it stays on a terminal.
+
+    The block is given what says something else from then on.
 
     Args:
         name: The sweep's name.
@@ -109,23 +114,29 @@ def working(name: str, what: str, progress: str) -> Iterator[None]:
         progress: The same as for `shown`.
     """
     started = time.monotonic()
+    spinner = Spinner("line", style="cyan")
 
     def line() -> str:
         return f"{name}: {what}, {duration(time.monotonic() - started, tenths=False)}"
 
+    def say(present: str) -> None:
+        nonlocal what
+        what = present
+        spinner.update(text=f"{name}: {what} ...")
+
+    say(what)
     if progress == "none":
-        yield
+        yield say
         return
     if kernel_shell() is not None:
         with NotebookView(name, lambda: f"{line()} ...", is_line=True):
-            yield
+            yield say
         return
     # Unlike `shown`, this leaves the streams alone: warnings of libraries are seen.
     with patient_stream() as stream:
         if stream.isatty() and not _shares_terminal:
-            spinner = Spinner("line", text=f"{name}: {what} ...", style="cyan")
             with Live(spinner, console=Console(file=stream), refresh_per_second=_REFRESH_PER_S, transient=True):
-                yield
+                yield say
         else:
             with _Lines(line, stream, at_the_end=False):
-                yield
+                yield say

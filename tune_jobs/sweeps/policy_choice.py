@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
 from analysis.best_records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
@@ -23,7 +23,7 @@ from analysis.selection import (
     tie_key,
 )
 from analysis.successive_rejects import Played, Rejects, successive_rejects
-from policies.acting.evaluate import MAX_EPISODE_STEPS
+from policies.acting.evaluate import MAX_EPISODE_STEPS, Episodes
 from policies.acting.load import policy_from_portable
 from policies.acting.policy import Policy
 from policies.errors import EnvError, NotFoundError, TuneJobsError
@@ -71,13 +71,21 @@ class Candidate:
     policy: PortablePolicy
 
 
-def choose_policy(store: Sweep, spec: SweepSpec, trials: Sequence[TrialRecord]) -> ChosenPolicy:
+def choose_policy(
+    store: Sweep,
+    spec: SweepSpec,
+    trials: Sequence[TrialRecord],
+    num_processes: int = 1,
+    say: Callable[[str], None] = lambda _: None,
+) -> ChosenPolicy:
     """Choose the policy to deploy among the kept checkpoints of all trials.
 
     Args:
         store: The sweep.
         spec: Its sweep file.
         trials: The result of `read_trials`.
+        num_processes: In how many processes at once slow environments are played at most.
+        say: Told how far the rounds are.
 
     Raises:
         NoUsableTrialError: No trial has a checkpoint that can be deployed; the message says why.
@@ -102,11 +110,19 @@ def choose_policy(store: Sweep, spec: SweepSpec, trials: Sequence[TrialRecord]) 
     num_more = min(MAX_EPISODES - num_first, EPISODES_A_CANDIDATE * len(candidates))
     seeds = evaluation_seeds(spec.seed, num_first + num_more)[num_first:]
 
+    num_env_steps = 0
+
     def play(numbers: Sequence[int], first: int, count: int) -> Sequence[Played]:
-        return evaluate_policies(
+        nonlocal num_env_steps
+        total = len(numbers) * count
+        so_far = f"{num_env_steps:,} of at most {max_env_steps:,} env steps"
+        played = evaluate_policies(
             [policies[number] for number in numbers], env_id=env_id, env_args=env_args,
-            seeds=seeds[first : first + count], timeout_s=timeout_s,
+            seeds=seeds[first : first + count], timeout_s=timeout_s, num_processes=num_processes,
+            told=lambda begun: say(f"choosing the best policy: {so_far}; {episode_of(begun, total)}"),
         )  # fmt: skip
+        num_env_steps += sum(sum(each.lengths) for each in played if isinstance(each, Episodes))
+        return played
 
     rejects = successive_rejects(
         [item.scored.score for item in candidates],
@@ -159,13 +175,18 @@ def most_env_steps(spec: SweepSpec, num_trials: int) -> int:
     return max(MIN_ENV_STEPS, min(MAX_ENV_STEPS, share))
 
 
-def with_runners_up(chosen: ChosenPolicy, confirmation: EvaluationRecord, timeout_s: float) -> ChoiceRecord:
+def with_runners_up(
+    chosen: ChosenPolicy, confirmation: EvaluationRecord, timeout_s: float, num_processes: int = 1,
+    say: Callable[[str], None] = lambda _: None,
+) -> ChoiceRecord:  # fmt: skip
     """Confirm the runners-up on the seeds that the winner was confirmed on, or the first of them where they are long.
 
     Args:
         chosen: What was chosen.
         confirmation: The winner's confirmation.
         timeout_s: How long one call of the environment may take.
+        num_processes: In how many processes at once slow environments are played at most.
+        say: Told how far it is.
     """
     choice = chosen.choice
     if not chosen.runners_up:
@@ -175,8 +196,10 @@ def with_runners_up(chosen: ChosenPolicy, confirmation: EvaluationRecord, timeou
     policies: list[Policy] = [policy_from_portable(policy) for _, policy in chosen.runners_up]
     try:
         played: Sequence[Played] = evaluate_policies(
-            policies, env_id=confirmation.env_id, env_args=confirmation.env_args, seeds=seeds, timeout_s=timeout_s
-        )
+            policies, env_id=confirmation.env_id, env_args=confirmation.env_args, seeds=seeds, timeout_s=timeout_s,
+            num_processes=num_processes,
+            told=lambda begun: say(f"confirming the runners-up: {episode_of(begun, len(policies) * len(seeds))}"),
+        )  # fmt: skip
     except EnvError as error:
         note = f"The runners-up could not be confirmed: {error.message}"
         return choice.model_copy(update={"note": " ".join(filter(None, (choice.note, note)))})
@@ -192,6 +215,11 @@ def with_runners_up(chosen: ChosenPolicy, confirmation: EvaluationRecord, timeou
         )
         candidates[place] = candidate.model_copy(update={"confirmation": record})
     return choice.model_copy(update={"candidates": tuple(candidates), "note": " ".join(filter(None, notes))})
+
+
+def episode_of(begun: int, total: int) -> str:
+    """Return how far episodes are, such as "episode 3 of 100"."""
+    return f"episode {max(1, min(begun, total)):,} of {total:,}"
 
 
 def confirmed_best(store: Sweep) -> BestRecord | None:
