@@ -182,8 +182,8 @@ class EnvGuard:
     def __init__(self) -> None:
         self._child: _Child | None = None
         self._others: list[EnvGuard] = []
-        self.episode_s: dict[str, float] = {}
-        """How long an episode takes in a child, in seconds, by what tells environments apart; see `spread`."""
+        self.episode_s: dict[str, list[float]] = {}
+        """How long an episode took in a child, in seconds, by what tells environments apart; see `spread`."""
 
     def others(self, num: int) -> list[EnvGuard]:
         """Return further guards, for jobs at the same time, whose children begin; they end with this one."""

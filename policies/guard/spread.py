@@ -60,19 +60,17 @@ def play_in_parts(
     key = json.dumps([env_id, env_args], sort_keys=True)
     job_arguments = {"timeout_s": timeout_s, "env_args": env_args, **arguments}
     parts = _Parts(guard, job, env_id, job_arguments, key, num_policies, told)
-    left, known = list(seeds), guard.episode_s
+    left, measured = list(seeds), guard.episode_s.setdefault(key, [])
 
     def worth(num_seeds: int) -> int:
         """Return how many children have work for long enough."""
-        expected_s = known.get(key, 0.0) * num_seeds * num_policies
+        expected_s = measured[-1] * num_seeds * num_policies if measured else 0.0
         return max(1, min(num_processes, _MOST, num_seeds, int(expected_s / _WORTH_S)))
 
-    if num_processes > 1 and key not in known:
-        # Before the first episode the child imports, which the second one doesn't wait for.
-        for _ in range(2):
-            if len(left) > 2 and (key not in known or worth(len(left)) > 1):
-                parts.play([left[:1]])
-                left = left[1:]
+    # Before its first episodes the child imports, for which the next ones don't wait.
+    while num_processes > 1 and len(left) > 2 and (not measured or (len(measured) == 1 and worth(len(left)) > 1)):
+        parts.play([left[:1]])
+        left = left[1:]
     parts.play(list(_divided(left, worth(len(left)))))
     return parts.results
 
@@ -120,7 +118,7 @@ class _Parts:
             raise
         self.num_played += self.num_policies * sum(map(len, parts))
         longest = max(map(len, parts)) * max(1, self.num_policies)
-        self.guard.episode_s[self.key] = (time.monotonic() - began) / longest
+        self.guard.episode_s[self.key].append((time.monotonic() - began) / longest)
 
 
 def _divided(seeds: Sequence[int], num: int) -> Iterator[Sequence[int]]:

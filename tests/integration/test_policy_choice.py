@@ -343,8 +343,8 @@ def test_all_is_played_with_the_cpus_that_there_are_and_tells_how_far_it_is(
 
         return played
 
-    monkeypatch.setattr(policy_choice, "evaluate_policies", noted(policy_choice.evaluate_policies))
-    monkeypatch.setattr(finish, "evaluate_policy", noted(finish.evaluate_policy))
+    monkeypatch.setattr(policy_choice, "evaluate_policies", noted(guarded.evaluate_policies))
+    monkeypatch.setattr(finish, "evaluate_policy", noted(guarded.evaluate_policy))
     best = finish.choose_best(make(LUCKY), 5, said.append)
     # In each round, the winner's confirmation, the random policy's and that of the runners-up.
     assert len(asked) >= present(best.choice).num_rounds + 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from contextvars import ContextVar
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 from policy_factory import make_policy
 
-from policies.acting.evaluate import Episodes, evaluate_policy
+from policies.acting.evaluate import MAX_ENVS, Episodes, evaluate_policy
 from policies.acting.policy import Policy, RandomPolicy
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
@@ -139,6 +140,25 @@ def test_what_is_known_of_an_env_is_not_asked_again(monkeypatch: pytest.MonkeyPa
         # Another env may take longer.
         played(policies, 2, step_s=0.001)
         assert begun[0] == [SEEDS[0]]
+
+
+def test_an_env_whose_first_episode_was_slow_alone_is_played_in_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, policies: list[Policy]
+) -> None:
+    pids, wait, begun = tmp_path / "pids", EnvGuard._wait, []
+
+    def slow_at_first(guard: EnvGuard, *args: Any) -> Any:
+        answer = wait(guard, *args)
+        begun.append(len(pids_of(pids)))
+        if len(begun) == 1:
+            time.sleep(1.0)
+        return answer
+
+    monkeypatch.setattr(EnvGuard, "_wait", slow_at_first)
+    played(policies, 8, pids=str(pids))
+    # The first seed, the second one, then all others.
+    assert begun == [1, 1, 1]
+    assert sum(pids_of(pids).values()) == 1 + 1 + MAX_ENVS
 
 
 def test_an_error_in_one_part_is_that_of_its_policy(monkeypatch: pytest.MonkeyPatch, policies: list[Policy]) -> None:
