@@ -70,13 +70,18 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     if not is_of_env(error):
         raise error
     detail = said_by(error)
+    if (place := place_in_env(error)) is not None:
+        detail += f" ({place})" if detail else f"at {place}"
+    return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint)
+
+
+def place_in_env(error: BaseException) -> Frame | None:
+    """Return where in an env's own code an exception comes from; None: from none of it."""
     frames = [
         Frame(frame.f_code.co_filename, line, frame.f_code.co_name) for frame, line in walk_tb(error.__traceback__)
     ]
     # The outermost frame is the caller's.
-    if (place := frame_of_env(frames[:0:-1])) is not None:
-        detail += f" ({place})" if detail else f"at {place}"
-    return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint)
+    return frame_of_env(frames[:0:-1])
 
 
 class Frame(NamedTuple):
@@ -110,7 +115,9 @@ def frame_of_env(frames: Sequence[Frame]) -> Frame | None:
 def _is_around(file: str) -> bool:
     """Whether a file belongs to this package, or to Gymnasium except its environments."""
     path = PurePath(file)
-    return ("gymnasium" in path.parts and "envs" not in path.parts) or _PACKAGE in path.parents
+    # By the one that registers environments they are made, too.
+    of_gymnasium = "gymnasium" in path.parts and ("envs" not in path.parts or path.name == "registration.py")
+    return of_gymnasium or _PACKAGE in path.parents
 
 
 def close_env(env: Any) -> None:

@@ -24,7 +24,7 @@ from policies.envs import atari, calls
 from policies.envs.calls import Call
 from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
-from policies.envs.faults import close_env, is_of_env
+from policies.envs.faults import close_env, is_of_env, place_in_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
@@ -332,7 +332,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
         raise error
     if isinstance(error, EnvError):  # raised by a wrapper, with a message of its own
         return error
-    detail = said_by(error) or "no message"
+    detail = said_by(error) or f"at {place_in_env(error) or 'a place that is not its own'}"
     given = constructor_args(env_args or {})
     arguments = f" with arguments {given!r}" if given else ""
     message = f"The environment {env_id!r} cannot be made{arguments}: {type(error).__name__}: {detail}."

@@ -87,7 +87,9 @@ def test_one_policy_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, policie
         assert len(pids_of(pids)) == 2
 
 
-def test_a_fast_env_is_played_in_one(tmp_path: Path, policies: list[Policy]) -> None:
+def test_a_fast_env_is_played_in_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, policies: list[Policy]) -> None:
+    # However much else this machine does.
+    monkeypatch.setattr(spread, "_WORTH_S", 60.0)
     pids = tmp_path / "pids"
     played(policies, 8, pids=str(pids))
     assert len(pids_of(pids)) == 1
@@ -145,6 +147,8 @@ def test_what_is_known_of_an_env_is_not_asked_again(monkeypatch: pytest.MonkeyPa
 def test_an_env_whose_first_episode_was_slow_alone_is_played_in_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, policies: list[Policy]
 ) -> None:
+    # One second is worth it for what follows, and half a second is not.
+    monkeypatch.setattr(spread, "_WORTH_S", 8.0)
     pids, wait, begun = tmp_path / "pids", EnvGuard._wait, []
 
     def slow_at_first(guard: EnvGuard, *args: Any) -> Any:

@@ -175,6 +175,12 @@ def test_a_wrong_value_that_only_the_constructor_finds_is_an_env_error() -> None
         check_env("LunarLander-v3", {"gravity": 5.0}, None)
 
 
+def test_a_constructor_that_fails_without_a_word_is_told_with_its_place() -> None:
+    with pytest.raises(EnvError, match=r": AssertionError: at \S*hostile_envs.py:\d+ in assume\.\n") as caught:
+        check_env("hostile_envs:Hostile", {"how": "assume", "where": "constructor"}, None)
+    assert "documentation" in caught.value.hint
+
+
 @pytest.mark.parametrize(
     ("spaces", "words"),
     [
