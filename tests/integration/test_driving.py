@@ -81,7 +81,7 @@ def test_a_signal_while_the_rest_is_made_ends_it_and_keeps_the_state(
 ) -> None:
     made = []
 
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         os.kill(os.getpid(), number)
         made.append("more")
 
