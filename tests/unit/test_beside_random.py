@@ -99,7 +99,7 @@ def test_the_report_proposes_neither_more_seeds_nor_a_narrower_space_as_next_ste
 
 
 def finished(store: SweepStore, monkeypatch: pytest.MonkeyPatch, best: BestRecord) -> tuple[str, ...]:
-    monkeypatch.setattr(conclude, "choose_best", lambda _: best)
+    monkeypatch.setattr(conclude, "choose_best", lambda *_, **__: best)
     monkeypatch.setattr(conclude, "make_videos", lambda _: {})
     monkeypatch.setattr(conclude, "make_report", lambda *_: store.folder)
     monkeypatch.setattr("tune_jobs.sweeps.finishing._Finish._films_and_report", lambda *_: None)

@@ -100,7 +100,7 @@ def test_attach_names_no_outdated_winner(extended: SweepStore, monkeypatch: pyte
     why = f"the one there is was chosen before the sweep was trained on. `tune-jobs best {extended.folder}` does it"
     assert present(result.why_no_best).startswith(why)
 
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise EnvFailedError("The simulator is down.", "")
 
     monkeypatch.setattr(conclude, "choose_best", broken)
