@@ -58,6 +58,12 @@ def descendants(pid: int) -> dict[int, str]:
     return found
 
 
+def named(pid: int, *programs: str) -> dict[str, int]:
+    """Those of the processes below one whose first word contains a program's name, by these names."""
+    lines = descendants(pid).items()
+    return {name: found for name in programs for found, line in lines if name in line.split(" ")[0]}
+
+
 def wait_until(condition: Callable[[], object], process: subprocess.Popen[str], limit_s: float = 240) -> None:
     deadline = time.monotonic() + limit_s
     while not condition():
@@ -208,9 +214,15 @@ def test_a_signal_while_the_main_thread_waits_for_a_dead_part_of_ray(start: Star
     folder = tmp_path / "sweeps" / "cut"
     process = start()
     wait_until(functools.partial(has_new, folder, set()), process)
-    control = child(process.pid, "gcs_server")
-    pack = next(pid for pid, line in descendants(process.pid).items() if line.startswith("ray::PackTrainable"))
-    assert control is not None
+    # Whoever begins or ends meanwhile may hide others in what the system tells of a process's children.
+    pids: dict[str, int] = {}
+
+    def are_known() -> bool:
+        pids.update(named(process.pid, "gcs_server", "ray::PackTrainable"))
+        return len(pids) == 2
+
+    wait_until(are_known, process)
+    control, pack = pids["gcs_server"], pids["ray::PackTrainable"]
     os.kill(control, signal.SIGSTOP)
     # What the pack had is given back when its process has died, which the control process has to confirm.
     os.kill(pack, signal.SIGKILL)
