@@ -5,8 +5,9 @@ the plan, the confirmation and the videos, it would end the process that drives 
 process, which is waited for as long as its calls (see `calls`) make progress. The child has the same import path as the
 processes of trials: the working directory and the main script's folder, which Ray gives those, and PYTHONPATH.
 
-One child does the work of one call of the Python API or one command, from the plan to the videos. It starts in less
-than half a second, while its parent does other work.
+One child does the work of one call of the Python API or one command, from the plan to the videos, but for the episodes
+of slow environments, which several play (see `spread`). It starts in less than half a second, while its parent does
+other work.
 """
 
 from __future__ import annotations
@@ -85,6 +86,8 @@ class _Child:
         self.surroundings = surroundings
         self.modules: set[str] = set()
         self.has_worked = False
+        self.is_busy = False
+        """Whether it has a job whose answer was not read."""
         self._starter = threading.current_thread()
         with standard_streams():
             self._begin()
@@ -203,8 +206,8 @@ class EnvGuard:
             other.close()
         if self._child is not None:
             child, self._child = self._child, None
-            # Before its first job, the child has nothing to clean up.
-            child.close(patience_s=_PATIENCE_S if child.has_worked else 0.0)
+            # Before its first job the child has nothing to clean up; what nobody waits for need not come to its end.
+            child.close(patience_s=_PATIENCE_S if child.has_worked and not child.is_busy else 0.0)
 
     def __enter__(self) -> Self:
         return self
@@ -260,6 +263,7 @@ class EnvGuard:
             "module_folders": module_folders(),
             "arguments": {"env_id": env_id, **arguments},
         }
+        child.is_busy = True
         # That the child has ended is noticed when its answer is read.
         with self._lost_if_it_fails(child), contextlib.suppress(OSError):
             child.connection.send_bytes(json.dumps(asked).encode())
@@ -267,7 +271,7 @@ class EnvGuard:
         def result() -> Any:
             with self._lost_if_it_fails(child):
                 answer = self._wait(child, env_id, timeout_s, look)
-            child.has_worked = True
+            child.has_worked, child.is_busy = True, False
             if "error" in answer:
                 raise _error(answer["error"])
             return answer["result"]
@@ -293,6 +297,9 @@ class EnvGuard:
     def _ready_child(self) -> _Child:
         """Return a child with this process's present surroundings; a new one is started if they have changed."""
         modules = set(allowed_modules())
+        if self._child is not None and self._child.is_busy:
+            # Whoever asked was interrupted before he waited: what it says next is no answer to this job.
+            self.give_up()
         child = self._child
         if child is not None and (
             child.was_lost

@@ -101,7 +101,7 @@ class _Parts:
 
         # Together they hold as many environments as one does.
         max_envs = math.ceil(MAX_ENVS / len(parts))
-        answered = 0
+        unasked = list(guards)
         try:
             waiting = [
                 each.begin(self.job, self.env_id, look=look, seeds=part, max_envs=max_envs, **self.arguments)
@@ -109,11 +109,12 @@ class _Parts:
             ]
             resets_before = sum(each.num_resets for each in guards)
             for result in waiting:
+                # If an error comes of it, it is ready for more, or has ended.
+                unasked.pop(0)
                 self.results.append(result())
-                answered += 1
         except BaseException:
-            # The others still play, and nobody waits for them. The one that this came from is ready, or has ended.
-            for each in guards[answered + 1 :]:
+            # They still play, and nobody waits for them.
+            for each in unasked:
                 each.give_up()
             raise
         self.num_played += self.num_policies * sum(map(len, parts))

@@ -339,7 +339,7 @@ def test_what_finishing_does_now_takes_the_place_of_what_it_did(*, on_terminal: 
         os.close(theirs)
         assert process.stdin is not None
         seen, until = b"", time.monotonic() + 60
-        while b"mine: choosing the best policy" not in seen:
+        while b"mine: choosing the best policy" not in seen and time.monotonic() < until:
             seen += os.read(ours, 1_000)
         process.stdin.write(b"confirming the best policy: episode 3 of 100\n")
         process.stdin.flush()

@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from contextvars import ContextVar
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from policies.acting.evaluate import MAX_ENVS, Episodes, evaluate_policy
 from policies.acting.policy import Policy, RandomPolicy
 from policies.envs import modules as env_modules
 from policies.envs.modules import allow_modules
-from policies.errors import EnvFailedError, TuneJobsError
+from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from policies.guard import guarded, spread
 from policies.guard.guard import EnvGuard, guarding
 
@@ -147,18 +148,17 @@ def test_what_is_known_of_an_env_is_not_asked_again(monkeypatch: pytest.MonkeyPa
 def test_an_env_whose_first_episode_was_slow_alone_is_played_in_one(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, policies: list[Policy]
 ) -> None:
-    # One second is worth it for what follows, and half a second is not.
-    monkeypatch.setattr(spread, "_WORTH_S", 8.0)
     pids, wait, begun = tmp_path / "pids", EnvGuard._wait, []
 
-    def slow_at_first(guard: EnvGuard, *args: Any) -> Any:
+    def noted(guard: EnvGuard, *args: Any) -> Any:
         answer = wait(guard, *args)
         begun.append(len(pids_of(pids)))
-        if len(begun) == 1:
-            time.sleep(1.0)
         return answer
 
-    monkeypatch.setattr(EnvGuard, "_wait", slow_at_first)
+    monkeypatch.setattr(EnvGuard, "_wait", noted)
+    # When each job begins and ends: the first takes a second, the others a hundredth, whatever else this machine does.
+    times = iter([0.0, 1.0, 2.0, 2.01, 3.0, 3.01])
+    monkeypatch.setattr(spread, "time", SimpleNamespace(monotonic=times.__next__))
     played(policies, 8, pids=str(pids))
     # The first seed, the second one, then all others.
     assert begun == [1, 1, 1]
@@ -192,7 +192,7 @@ def test_who_ends_or_hangs_in_one_part_ends_all(
     with guarding():
         with pytest.raises(EnvFailedError, match=WORDS[broken]):
             guarded.evaluate_policies(
-                policies, env_id=PATIENT, env_args=args, seeds=SEEDS, num_processes=3, timeout_s=2
+                policies, env_id=PATIENT, env_args=args, seeds=SEEDS, num_processes=3, timeout_s=5
             )
         # Where it ends at once, the others may not have begun yet.
         assert len(pids_of(pids)) == 3 or (broken == "exit" and place == 2)
@@ -220,7 +220,7 @@ def test_an_interruption_ends_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
         def when_all_play() -> Any:
             while kwargs["max_envs"] < 16 and len(pids_of(pids)) < 3:
-                pass
+                time.sleep(0.01)
             return result()
 
         return when_all_play
@@ -233,6 +233,37 @@ def test_an_interruption_ends_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
         assert len(pids_of(pids)) == 3
         assert not any(map(is_running, pids_of(pids)))
     assert os.getpid() not in pids_of(pids)
+
+
+def test_where_one_cannot_begin_nobody_plays_on_and_the_next_answers_are_the_right_ones(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, policies: list[Policy]
+) -> None:
+    monkeypatch.setattr(spread, "_WORTH_S", 0.01)
+    pids, others = tmp_path / "pids", EnvGuard.others
+
+    def broken(guard: EnvGuard, num: int) -> list[EnvGuard]:
+        def begin(**_: Any) -> Any:
+            raise CannotRunError("No process can be started.")
+
+        found = others(guard, num)
+        for each in found[1:]:
+            monkeypatch.setattr(each, "begin", lambda *_, **__: begin())
+        return found
+
+    with guarding():
+        with monkeypatch.context() as patch:
+            patch.setattr(EnvGuard, "others", broken)
+            with pytest.raises(CannotRunError):
+                played(policies, 3, step_s=0.002, pids=str(pids))
+        assert not any(map(is_running, pids_of(pids)))
+        assert played(policies, 1) == [evaluate_policy(policy, env_id=PATIENT, seeds=SEEDS) for policy in policies]
+
+
+def test_an_answer_that_nobody_waited_for_is_not_that_of_the_next_job() -> None:
+    with guarding() as guard:
+        guard.begin("check_env", "CartPole-v1", env_args={}, algorithm=None)
+        told = guard.run("check_env", "Pendulum-v1", env_args={}, algorithm=None)
+        assert told["env_id"] == "Pendulum-v1"
 
 
 def test_it_is_told_how_many_episodes_have_begun(monkeypatch: pytest.MonkeyPatch, policies: list[Policy]) -> None:

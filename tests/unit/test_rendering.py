@@ -125,4 +125,6 @@ print(picture.shape, picture.std() > 10)
 env.close()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("(480, 480, 3) True\n", "")
+    # What Mesa says of this machine's drivers is its own.
+    said = [line for line in done.stderr.splitlines() if not line.startswith(("libEGL", "MESA"))]
+    assert (done.stdout, said) == ("(480, 480, 3) True\n", [])
