@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -251,3 +252,38 @@ def test_it_is_shown_how_far_the_confirmation_is(
     assert numbers == sorted(numbers)
     assert 1 <= numbers[0] < 20
     assert 80 < numbers[-1] <= 100
+
+
+CONFIRMED = ["confirming the best policy", "playing at random"]
+
+
+@pytest.mark.parametrize(
+    ("command", "progress", "said"),
+    [
+        (sweeps.best, "none", ["choosing the best policy", *CONFIRMED]),
+        (sweeps.evaluate, "auto", ["reading the policy", *CONFIRMED, "playing", "playing at random"]),
+        (sweeps.video, "auto", ["reading the policy", *CONFIRMED, "filming"]),
+        (sweeps.report, "none", ["writing the report", *CONFIRMED, "writing the report"]),
+    ],
+)
+def test_each_command_shows_how_far_it_is(
+    sweep_of: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch, command: Callable[..., Any], progress: str,
+    said: list[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr("policies.guard.guard._LOOK_S", 0.002)
+    shown: list[str] = []
+    asked: list[str] = []
+
+    @contextlib.contextmanager
+    def working(name: str, what: str, progress: str) -> Iterator[Callable[[str], None]]:
+        asked.extend((name, progress))
+        shown.append(what)
+        yield shown.append
+
+    monkeypatch.setattr("tune_jobs.sweeps.live_view.working", working)
+    store = sweep_of()
+    command(store.folder, progress=progress)
+    assert asked in ([store.name, progress], [str(store.folder), progress])
+    # Without how far each is.
+    words = [re.split("[:,]", text)[0] for text in shown]
+    assert [word for number, word in enumerate(words) if words[number - 1 : number] != [word]] == said

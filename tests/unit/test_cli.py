@@ -27,8 +27,9 @@ def options(**given: Any) -> dict[str, Any]:
 
 
 LAUNCHED = {"overrides": ("a.b=1", "c=2"), "name": "n"}
-EVALUATED = {"storage": None, "num_episodes": 100, "first_seed": None, "env_id": None, "action": None}
-FILMED = {"storage": None, "output": None, "seed": None, "env_id": None, "action": None}
+SHOWN = {"storage": None, "progress": "auto"}
+EVALUATED = {**SHOWN, "num_episodes": 100, "first_seed": None, "env_id": None, "action": None}
+FILMED = {**SHOWN, "output": None, "seed": None, "env_id": None, "action": None}
 COMMANDS = [
     (
         "launch x.yaml --set a.b=1 --set c=2 --name n --address auto --no-finish",
@@ -49,7 +50,8 @@ COMMANDS = [
     ("status mine --storage s", ("status", ("mine",), {"storage": "s"})),
     ("list --storage s", ("list_sweeps", ("s",), {})),
     ("trials mine", ("trials", ("mine",), {"storage": None})),
-    ("best mine", ("best", ("mine",), {"storage": None, "num_episodes": 100})),
+    ("best mine", ("best", ("mine",), {**SHOWN, "num_episodes": 100})),
+    ("best mine --progress none", ("best", ("mine",), {"storage": None, "num_episodes": 100, "progress": "none"})),
     (
         "evaluate mine/t0001 --num-episodes 7 --first-seed 0",
         ("evaluate", ("mine/t0001",), {**EVALUATED, "num_episodes": 7, "first_seed": 0}),
@@ -65,7 +67,8 @@ COMMANDS = [
     ),
     ("video mine", ("video", ("mine",), FILMED)),
     ("video mine --output out --seed 0", ("video", ("mine",), {**FILMED, "output": "out", "seed": 0})),
-    ("report mine", ("report", ("mine",), {"storage": None})),
+    ("report mine", ("report", ("mine",), SHOWN)),
+    ("report mine --progress none", ("report", ("mine",), {"storage": None, "progress": "none"})),
 ]
 
 

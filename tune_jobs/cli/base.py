@@ -179,6 +179,11 @@ action_option = click.option(
 )  # fmt: skip
 
 
+progress_option = click.option(
+    "--progress", type=click.Choice(["auto", "none"]), default="auto", help="Show how far it is, or nothing."
+)
+
+
 def run_options(command: _Command) -> _Command:
     """Add the options of the commands that run trials."""
     for option in (

@@ -7,7 +7,7 @@ standard output is one JSON document, also when a command fails; everything else
 from __future__ import annotations
 
 import gc
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -23,6 +23,7 @@ from tune_jobs.cli.base import (
     json_option,
     num_episodes_option,
     print_version,
+    progress_option,
     run_options,
     set_option,
     source_argument,
@@ -33,11 +34,14 @@ from tune_jobs.cli.base import (
 from tune_jobs.cli.completion import complete_algorithms, complete_presets, complete_specs
 from tune_jobs.cli.detached_runs import job_facts, refuse_dry_run_of_job
 from tune_jobs.cli.inject_command import inject
-from tune_jobs.cli.result_commands import compare, export, importance, reproduce
+from tune_jobs.cli.result_commands import compare, export, importance, report, reproduce
 from tune_jobs.cli.running import run_verb
 from tune_jobs.cli.serve_command import serve
 from tune_jobs.cli.server import here_only, program, remember_server, server_of, server_options, verbs
 from tune_jobs.cli.token_commands import token
+
+if TYPE_CHECKING:
+    from tune_jobs.sweeps.outcome import Progress
 
 _NEW_OBJECTS = 20_000
 """How many more there are before Python looks for garbage among them; 700 in Python 3.11."""
@@ -224,16 +228,17 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
 @cli.command()
 @sweep_argument
 @num_episodes_option
+@progress_option
 @allow_module_option
 @storage_option
 @json_option
-def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -> None:
+def best(*, sweep: str, num_episodes: int, progress: Progress, storage: str | None, as_json: bool) -> None:
     """Choose the best checkpoint, confirm it on fresh seeds and export its policy."""
     from tune_jobs.cli import output as cli_output
 
     sweeps = verbs()
     with stdout_for(as_json=as_json):
-        record = sweeps.best(sweep, storage=storage, num_episodes=num_episodes)
+        record = sweeps.best(sweep, storage=storage, num_episodes=num_episodes, progress=progress)
     cli_output.show_best(record, as_json=as_json)
 
 
@@ -243,6 +248,7 @@ def best(*, sweep: str, num_episodes: int, storage: str | None, as_json: bool) -
 @click.option("--first-seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the first episode; they count up.")
 @env_option
 @action_option
+@progress_option
 @allow_module_option
 @storage_option
 @json_option
@@ -253,6 +259,7 @@ def evaluate(
     first_seed: int | None,
     env_id: str | None,
     action: int | tuple[float, ...] | None,
+    progress: Progress,
     storage: str | None,
     as_json: bool,
 ) -> None:
@@ -268,7 +275,13 @@ def evaluate(
     _check_baseline(source, env_id)
     with stdout_for(as_json=as_json):
         policy, random = sweeps.evaluate(
-            source, storage=storage, num_episodes=num_episodes, first_seed=first_seed, env_id=env_id, action=action
+            source,
+            storage=storage,
+            num_episodes=num_episodes,
+            first_seed=first_seed,
+            env_id=env_id,
+            action=action,
+            progress=progress,
         )
     cli_output.show_evaluation(policy, random, as_json=as_json)
 
@@ -279,6 +292,7 @@ def evaluate(
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of the episode.")
 @env_option
 @action_option
+@progress_option
 @allow_module_option
 @storage_option
 @json_option
@@ -289,6 +303,7 @@ def video(
     seed: int | None,
     env_id: str | None,
     action: int | tuple[float, ...] | None,
+    progress: Progress,
     storage: str | None,
     as_json: bool,
 ) -> None:
@@ -301,7 +316,9 @@ def video(
     sweeps = verbs()
     _check_baseline(source, env_id)
     with stdout_for(as_json=as_json):
-        paths = sweeps.video(source, storage=storage, output=output, seed=seed, env_id=env_id, action=action)
+        paths = sweeps.video(
+            source, storage=storage, output=output, seed=seed, env_id=env_id, action=action, progress=progress
+        )
     cli_output.show_paths(paths, as_json=as_json)
 
 
@@ -310,26 +327,7 @@ def _check_baseline(source: str, env_id: str | None) -> None:
         raise SpecError(f"A {source} policy has no environment of its own.", "Add --env, such as --env CartPole-v1.")
 
 
-@cli.command()
-@sweep_argument
-@click.option("-o", "--output", metavar="PATH", help="With --server: file, or folder with /, to download the page to.")
-@allow_module_option
-@storage_option
-@json_option
-def report(*, sweep: str, output: str | None, storage: str | None, as_json: bool) -> None:
-    """Write the report of a sweep: one HTML page, tables and figures."""
-    from tune_jobs.cli import output as cli_output
-
-    if output is not None and server_of() is None:
-        raise SpecError("--output goes with --server alone: a report lies in its sweep's folder.", "Leave it out.")
-    sweeps = verbs()
-    to = {} if output is None else {"output": output}
-    with stdout_for(as_json=as_json):
-        path = sweeps.report(sweep, storage=storage, **to)
-    cli_output.show_paths({"report": path}, as_json=as_json)
-
-
-for _command in (attach, compare, export, importance, inject, reproduce, serve, token):
+for _command in (attach, compare, export, importance, inject, report, reproduce, serve, token):
     cli.add_command(_command)
 
 

@@ -53,7 +53,7 @@ class RemoteVerbs:
             return False
         return True
 
-    def best(self, sweep: str, *, storage: None = None, num_episodes: int = 0) -> BestRecord:  # noqa: ARG002
+    def best(self, sweep: str, *, num_episodes: int = 0, **_: Any) -> BestRecord:  # noqa: ARG002
         """Return the policy that was chosen when the sweep ended."""
         return self._client.best(sweep)
 
@@ -67,7 +67,7 @@ class RemoteVerbs:
         """Compare sweeps or settings."""
         return self._client.compare(sources, objective=objective, top=top)
 
-    def report(self, sweep: str, *, storage: None = None, output: str | None = None) -> Path:  # noqa: ARG002
+    def report(self, sweep: str, *, output: str | None = None, **_: Any) -> Path:
         """Download the page of a sweep's report, and return its path."""
         default = f"{sweep}-report.html"
         to = Path(default) if output is None else Path(output) / default if _is_folder(output) else Path(output)

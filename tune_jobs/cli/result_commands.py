@@ -1,4 +1,4 @@
-"""The commands about what sweeps gave: compare, export, importance, reproduce."""
+"""The commands about what sweeps gave: compare, export, importance, report, reproduce."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from policies.errors import SpecError
 from tune_jobs.cli.base import (
     allow_module_option,
     json_option,
+    progress_option,
     source_argument,
     sources_argument,
     stdout_for,
@@ -16,13 +18,13 @@ from tune_jobs.cli.base import (
     sweep_argument,
     sweeps_argument,
 )
-from tune_jobs.cli.server import here_only
+from tune_jobs.cli.server import here_only, server_of
 from tune_jobs.cli.server import verbs as verbs_of_command
 
 if TYPE_CHECKING:
     from analysis.records import Objective
     from tune_jobs.sweeps.exports import Format
-    from tune_jobs.sweeps.verbs import Progress
+    from tune_jobs.sweeps.outcome import Progress
 
 # Not imported from where they are declared, as help would then wait for NumPy; a test compares them.
 OBJECTIVES = ("final", "area", "best", "steps_to_threshold")
@@ -111,6 +113,26 @@ def importance(*, sweep: str, storage: str | None, as_json: bool) -> None:
     with stdout_for(as_json=as_json):
         found = does.importance(sweep, storage=storage)
     importance_view.show_importance(found, as_json=as_json)
+
+
+@click.command()
+@sweep_argument
+@click.option("-o", "--output", metavar="PATH", help="With --server: file, or folder with /, to download the page to.")
+@progress_option
+@allow_module_option
+@storage_option
+@json_option
+def report(*, sweep: str, output: str | None, progress: Progress, storage: str | None, as_json: bool) -> None:
+    """Write the report of a sweep: one HTML page, tables and figures."""
+    from tune_jobs.cli import output as cli_output
+
+    if output is not None and server_of() is None:
+        raise SpecError("--output goes with --server alone: a report lies in its sweep's folder.", "Leave it out.")
+    does = verbs_of_command()
+    to = {} if output is None else {"output": output}
+    with stdout_for(as_json=as_json):
+        path = does.report(sweep, storage=storage, progress=progress, **to)
+    cli_output.show_paths({"report": path}, as_json=as_json)
 
 
 @click.command()

@@ -140,6 +140,7 @@ def find_policy(
     storage: str | Path | None = None,
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> PolicySource:
     """Find a policy by any kind of source.
 
@@ -150,6 +151,7 @@ def find_policy(
         storage: The folder in which sweeps are looked up by name.
         env_id: The environment it acts in; None: the one it was trained in. A baseline needs one.
         action: The action of `constant`; None: 0.
+        say: Told how far it is where the best is chosen now.
 
     Raises:
         NotFoundError: There is no such thing.
@@ -174,7 +176,7 @@ def find_policy(
         timeout_s = stored_spec(store.read_record()).iteration_timeout_s
         if trial_id is None:
             if not has_current_best(store):
-                choose_best(store)
+                choose_best(store, say=say)
             policy = load_policy(store.best_folder)
         else:
             checkpoint = store.checkpoint_folder(best_checkpoint(store, trial_id))
@@ -206,16 +208,22 @@ def _baseline(name: str, env_id: str | None, action: int | Sequence[float] | Non
 
 @guarding()
 def evaluate(
-    source: PolicySource, num_episodes: int, first_seed: int | None
+    source: PolicySource, num_episodes: int, first_seed: int | None, say: Callable[[str], None]
 ) -> tuple[EvaluationRecord, EvaluationRecord]:
     """Play greedy episodes of a policy, and of a random one on the same seeds; see `verbs.evaluate`."""
     first = FRESH_SEED if first_seed is None else first_seed
     seeds = range(first, first + num_episodes)
     env_id, env_args, timeout_s = source.env_id, source.env_args, source.timeout_s
     cpus = cpus_for_episodes(None)
-    record = run_evaluation(source.policy, env_id, env_args, seeds, timeout_s, num_processes=cpus)
-    random = random_policy(env_id, env_args, timeout_s)
-    return record, run_evaluation(random, env_id, env_args, seeds, timeout_s, num_processes=cpus)
+
+    def played(policy: Policy, what: str) -> EvaluationRecord:
+        return run_evaluation(
+            policy, env_id, env_args, seeds, timeout_s, num_processes=cpus,
+            told=lambda begun: say(f"{what}: {episode_of(begun, num_episodes)}"),
+        )  # fmt: skip
+
+    record = played(source.policy, "playing")
+    return record, played(random_policy(env_id, env_args, timeout_s), "playing at random, to compare with it")
 
 
 def _refuse_action(source: str, action: int | Sequence[float] | None) -> None:
@@ -353,21 +361,25 @@ def make_video(source: PolicySource, output: Path, seed: int) -> dict[str, Path]
 
 
 @guarding()
-def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
+def make_report(
+    store: Sweep, why_no_best: TuneJobsError | None = None, say: Callable[[str], None] = lambda _: None
+) -> Path:
     """Write the sweep's tables, figures and HTML report; works without a winner, and says why there is none.
 
     Args:
         store: The sweep.
         why_no_best: Why its winner could not be confirmed just now; None: it was confirmed, or this was not tried.
+        say: Told how far it is where the winner is chosen now, and that the report is written then.
     """
     best = None
     if why_no_best is None:
         try:
-            best = _known_best(store)
+            best = _known_best(store, say)
         except (EnvError, NoUsableTrialError, CheckpointError) as error:
             why_no_best = error
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None
+    say("writing the report")
     matter = ReportMatter.read(store, best, why_no_best)
     videos = videos_of(store) if why_no_best is None else {}
     with store.writing_report() as target:
@@ -375,11 +387,11 @@ def make_report(store: Sweep, why_no_best: TuneJobsError | None = None) -> Path:
     return store.report_files()[name]
 
 
-def _known_best(store: Sweep) -> BestRecord:
+def _known_best(store: Sweep, say: Callable[[str], None]) -> BestRecord:
     """Return the confirmed winner, which is confirmed now if it has not been."""
     try:
         return store.read_best()
     except NotFoundError as error:
         if isinstance(error, CheckpointError):
             leave_out(error)
-        return choose_best(store)
+        return choose_best(store, say=say)

@@ -18,6 +18,8 @@ from tune_jobs.sweeps.storage import folder_at, shown_place
 
 Film = Literal["before_mp4", "after_mp4", "after_gif", "before_after_mp4"]
 """What a film of a sweep's best policy is called; before is a random policy."""
+Progress = Literal["auto", "none"]
+"""Whether a person is shown how far something is."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from analysis.best_records import BestRecord, EvaluationRecord
 from policies.arguments import NumEpisodes, Seed, checked
 from policies.envs.modules import allowed_again
 from policies.guard.guard import guarding
+from tune_jobs.sweeps.outcome import Progress
 from tune_jobs.sweeps.results import Films
 from tune_jobs.sweeps.storage import expanded
 
@@ -23,16 +24,31 @@ if TYPE_CHECKING:
 
 @allowed_again()
 @checked
-def best(sweep: str | Path, *, storage: str | Path | None = None, num_episodes: NumEpisodes = 100) -> BestRecord:
+def best(
+    sweep: str | Path,
+    *,
+    storage: str | Path | None = None,
+    num_episodes: NumEpisodes = 100,
+    progress: Progress = "auto",
+) -> BestRecord:
     """Choose a sweep's winner, confirm it on fresh seeds, and copy its policy to best/.
+
+    Args:
+        sweep: Name or folder.
+        storage: Folder for sweeps.
+        num_episodes: On how many episodes it is confirmed.
+        progress: Whether it is told on standard error how far it is, as for `launch`.
 
     Raises:
         NotFoundError: There is no such sweep, or none of its trials can win (the message says why).
     """
     from tune_jobs.sweeps.conclude import choose_best
+    from tune_jobs.sweeps.live_view import working
     from tune_jobs.sweeps.sources import find_sweep
 
-    return choose_best(find_sweep(sweep, storage), num_episodes)
+    store = find_sweep(sweep, storage)
+    with working(store.name, "choosing the best policy", progress) as say:
+        return choose_best(store, num_episodes, say)
 
 
 @allowed_again()
@@ -46,6 +62,7 @@ def evaluate(
     first_seed: Seed | None = None,
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
+    progress: Progress = "auto",
 ) -> tuple[EvaluationRecord, EvaluationRecord]:
     """Run greedy episodes of a policy, and of a random one on the same seeds.
 
@@ -56,6 +73,7 @@ def evaluate(
         first_seed: Seeds are this and the next ones; None: seeds that no training or selection uses.
         env_id: An environment other than the policy's own; needed for a baseline.
         action: The action of `constant`; None: 0.
+        progress: The same as for `best`.
 
     Returns:
         The policy's record, and the random policy's.
@@ -64,8 +82,10 @@ def evaluate(
         NotFoundError: There is no such policy.
     """
     from tune_jobs.sweeps import conclude as finish
+    from tune_jobs.sweeps.live_view import working
 
-    return finish.evaluate(finish.find_policy(source, storage, env_id, action), num_episodes, first_seed)
+    with working(str(source), "reading the policy", progress) as say:
+        return finish.evaluate(finish.find_policy(source, storage, env_id, action, say), num_episodes, first_seed, say)
 
 
 @allowed_again()
@@ -79,6 +99,7 @@ def video(
     seed: Seed | None = None,
     env_id: str | None = None,
     action: int | Sequence[float] | None = None,
+    progress: Progress = "auto",
 ) -> Films:
     """Film a policy.
 
@@ -91,6 +112,7 @@ def video(
         seed: Episode to film; None: the first confirmation seed, or one that nothing else uses.
         env_id: An environment other than the policy's own; needed for a baseline.
         action: The action of `constant`; None: 0.
+        progress: The same as for `best`.
 
     Returns:
         The files.
@@ -100,13 +122,16 @@ def video(
         EnvError: The environment cannot be drawn.
     """
     from tune_jobs.sweeps import conclude as finish
+    from tune_jobs.sweeps.live_view import working
 
-    found = finish.find_policy(source, storage, env_id, action)
-    if output is None and found.store is not None:
-        return Films(finish.make_videos(found.store, seed))
-    name = str(source).replace("/", "-").lstrip(".-") or "policy"
-    target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
-    return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
+    with working(str(source), "reading the policy", progress) as say:
+        found = finish.find_policy(source, storage, env_id, action, say)
+        say("filming")
+        if output is None and found.store is not None:
+            return Films(finish.make_videos(found.store, seed))
+        name = str(source).replace("/", "-").lstrip(".-") or "policy"
+        target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
+        return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
 
 
 def _film_path(output: str | Path | None, name: str) -> Path:

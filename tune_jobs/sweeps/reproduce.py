@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, cast
+from typing import cast
 
 from analysis.comparison.repetition import Changed, Repetition, causes, first_difference
 from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialPlan, TrialRecord
@@ -37,7 +37,7 @@ from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.drive import git_commit, machine_here, settled
-from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.outcome import Progress, SweepResult
 from tune_jobs.sweeps.sources import find_source, find_trial
 from tune_jobs.sweeps.stages import run_sweep
 from tune_jobs.sweeps.storage import expanded, folder_at
@@ -53,7 +53,7 @@ def reproduce(
     *,
     output: str | Path | None = None,
     storage: str | Path | None = None,
-    progress: Literal["auto", "none"] = "auto",
+    progress: Progress = "auto",
 ) -> Repetition:
     """Run a trial again from its record, as it ran, and compare every iteration of the two; the trial is only read.
 

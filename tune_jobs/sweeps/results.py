@@ -12,6 +12,7 @@ from analysis.selection import score_trial
 from analysis.wording import PLAIN_NONE, return_text
 from policies.arguments import checked
 from policies.envs.modules import allowed_again
+from tune_jobs.sweeps.outcome import Progress
 
 if TYPE_CHECKING:
     from analysis.front_view import FrontView
@@ -102,13 +103,21 @@ def front_view_of(store: Sweep) -> FrontView:
 
 @allowed_again()
 @checked
-def report(sweep: str | Path, *, storage: str | Path | None = None) -> ReportPath:
+def report(sweep: str | Path, *, storage: str | Path | None = None, progress: Progress = "auto") -> ReportPath:
     """Write a sweep's report and return the path of its index.html.
+
+    Args:
+        sweep: Name or folder.
+        storage: Folder for sweeps.
+        progress: The same as for `best`.
 
     Raises:
         NotFoundError: There is no such sweep.
     """
     from tune_jobs.sweeps.conclude import make_report
+    from tune_jobs.sweeps.live_view import working
     from tune_jobs.sweeps.sources import find_sweep
 
-    return ReportPath(make_report(find_sweep(sweep, storage)))
+    store = find_sweep(sweep, storage)
+    with working(store.name, "writing the report", progress) as say:
+        return ReportPath(make_report(store, say=say))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from policies.arguments import PositiveInt, Seconds, checked
 from policies.envs.modules import allowed_again
@@ -25,7 +25,7 @@ from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_cr
 from tune_jobs.sweeps.detached import cancel_waiting
 from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled, write_new
 from tune_jobs.sweeps.exports import dataframe, export, figure, study
-from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.outcome import Progress, SweepResult
 from tune_jobs.sweeps.policies import best, evaluate, restore, video
 from tune_jobs.sweeps.prior import read_priors
 from tune_jobs.sweeps.reproduce import reproduce
@@ -36,12 +36,10 @@ from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storag
 from tune_jobs.sweeps.waiting import check_wait
 
 __all__ = [
-    "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
-    "export", "extend", "figure", "importance", "inject", "launch", "list_sweeps", "replicate", "report", "reproduce",
-    "restore", "resume", "status", "stop", "study", "trials", "video",
+    "CreatedSweep", "Progress", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive",
+    "evaluate", "export", "extend", "figure", "importance", "inject", "launch", "list_sweeps", "replicate", "report",
+    "reproduce", "restore", "resume", "status", "stop", "study", "trials", "video",
 ]  # fmt: skip
-
-Progress = Literal["auto", "none"]
 
 
 @checked
