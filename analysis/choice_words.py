@@ -42,8 +42,10 @@ def chosen_from(choice: ChoiceRecord) -> str:
     but = f" ({counted(left_out, 'other')} left out)" if left_out else ""
     if choice.num_rounds == 0:
         return f"{known}{but}; with one candidate nothing more was played"
+    # Episodes that are longer than those before them may take more.
+    most = "of at most" if choice.num_env_steps <= choice.max_env_steps else "in place of"
     spent = (
-        f"{counted(choice.num_episodes, 'more episode')} ({choice.num_env_steps:,} of at most "
+        f"{counted(choice.num_episodes, 'more episode')} ({choice.num_env_steps:,} {most} "
         f"{counted(choice.max_env_steps, 'env step')})"
     )
     tied = sum(item.reason == TIED for item in choice.candidates)

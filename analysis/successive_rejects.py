@@ -34,6 +34,8 @@ Play = Callable[[Sequence[int], int, int], Sequence[Played]]
 
 NOT_FINITE = "the mean of its returns is not a finite number"
 TIED = "a tie, from more env steps"
+GROWTH = 4
+"""How many times as many episodes as are known are played before it is asked again what one takes."""
 
 
 @dataclass
@@ -152,7 +154,11 @@ class _Rounds:
         if number == 1:
             # The first episode of each tells about how long episodes are.
             self._play(min(1, self._affordable()))
-        self._play(min(self._wanted(number), self._affordable()))
+        target = len(self.running[0].returns) + self._wanted(number)
+        known = len(self.running[0].returns)
+        # Not all at once: a few short episodes say little about those to come, which may take many times as long.
+        while self._play(min(target - known, self._affordable(), GROWTH * max(1, known))):
+            known = len(self.running[0].returns)
 
     def _wanted(self, number: int) -> int:
         """Return how many more episodes each candidate plays in a round, by the formula of the module."""
@@ -179,19 +185,20 @@ class _Rounds:
         """Return about how many env steps one episode of each candidate takes, by those that they have played."""
         return sum(max(1.0, item.num_env_steps / max(1, len(item.returns))) for item in self.running)
 
-    def _play(self, count: int) -> None:
+    def _play(self, count: int) -> bool:
+        """Let each candidate that is left play so many more episodes; return whether they did."""
         if count < 1 or self.note or len(self.running) < 2:
-            return
+            return False
         try:
             played = self.play([item.number for item in self.running], len(self.running[0].returns), count)
         except EnvError as error:
             # It hung or ended its process, and nobody knows for whose sake: what was known before decides.
             self.note = f"Round {self.num_rounds} could not be played: {error.message}"
-            return
+            return False
         failed = [result for result in played if isinstance(result, TuneJobsError)]
         if len(failed) == len(played):
             self.note = f"Round {self.num_rounds} could not be played: {failed[0].message}"
-            return
+            return False
         for standing, result in zip(self.running, played, strict=True):
             if isinstance(result, TuneJobsError):
                 self._out(standing, result.message)
@@ -204,6 +211,7 @@ class _Rounds:
         if not self.running:
             self.running = [self.all[0]]
             self.note = f"Round {self.num_rounds}: {NOT_FINITE}, of every candidate."
+        return True
 
     def _reject(self, num_kept: int) -> None:
         """Reject the worst; those with a score equal to that of the last one that is kept stay."""

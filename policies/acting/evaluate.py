@@ -23,9 +23,10 @@ from policies.acting.running import Running, step_together
 from policies.envs import calls
 from policies.envs.classic_rows import ClassicRows
 from policies.envs.faults import close_env
+from policies.envs.flat import FlatBox
 from policies.envs.make import make_env
 from policies.envs.masks import MaskedBox
-from policies.envs.own_actions import Choices
+from policies.envs.own_actions import Choices, Numbers
 from policies.envs.together import stepper_of
 from policies.errors import EnvError, SpecError
 
@@ -36,6 +37,7 @@ MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
 MAX_ENVS = 16
 """The most environments that are open at once, so that networks get batches."""
+_KINDS = (MaskedBox, FlatBox, Numbers, gym.spaces.Box, gym.spaces.Discrete, Choices)
 
 
 @dataclass(frozen=True)
@@ -292,13 +294,18 @@ def check_policy(policy: Policy, env: gym.Env[Any, Any]) -> None:
 
 def _are_same(ours: gym.Space[Any], theirs: gym.Space[Any]) -> bool:
     """Whether two spaces are of the same kind, shape and choices; bounds may differ."""
-    if type(ours) is not type(theirs) or ours.shape != theirs.shape:
+    if _kind(ours) is not _kind(theirs) or ours.shape != theirs.shape:
         return False
     if isinstance(ours, gym.spaces.Discrete) and isinstance(theirs, gym.spaces.Discrete):
         return (ours.n, ours.start) == (theirs.n, theirs.start)
     if isinstance(ours, Choices | MaskedBox) and isinstance(theirs, Choices | MaskedBox):
         return ours.sizes == theirs.sizes
     return True
+
+
+def _kind(space: gym.Space[Any]) -> type[gym.Space[Any]]:
+    """Return the class by which policies know a space: of a class of an env's own, the one that it comes from."""
+    return next((kind for kind in _KINDS if isinstance(space, kind)), type(space))
 
 
 def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:

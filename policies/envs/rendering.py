@@ -6,10 +6,13 @@ import os
 import subprocess
 import sys
 from functools import cache
+from importlib.util import find_spec
 
 _MUJOCO_GL = "MUJOCO_GL"
 _MUJOCO_BACKENDS = ("egl", "osmesa")
 """What MuJoCo draws with in memory, on a GPU if there is one, then on CPUs."""
+_CHOOSES_WHEN_IMPORTED = "dm_control"
+"""A package that draws with MuJoCo's backends, by the variable's value when it is imported."""
 _TRIAL_TIMEOUT_S = 30.0
 
 
@@ -17,7 +20,8 @@ def draw_without_display() -> None:
     """Let pygame and MuJoCo draw into memory if this machine has no display; call it before an env that draws is made.
 
     MuJoCo's part is done once the process has imported it: whoever draws nothing of it need not wait for a trial of its
-    libraries, which takes half a second.
+    libraries, which takes half a second. Where dm_control is installed, it is done in any case, as that would be too
+    late; so call it before an env's module is imported, too, if the env may be drawn later.
     """
     # Otherwise pygame prints a greeting on standard output and connects to a display.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -25,7 +29,9 @@ def draw_without_display() -> None:
         return
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
-    if "mujoco" in sys.modules and _MUJOCO_GL not in os.environ and (name := _mujoco_backend()) is not None:
+    if _MUJOCO_GL in os.environ or not ("mujoco" in sys.modules or find_spec(_CHOOSES_WHEN_IMPORTED)):
+        return
+    if (name := _mujoco_backend()) is not None:
         os.environ[_MUJOCO_GL] = name
 
 

@@ -32,6 +32,8 @@ def test_the_summary_tells_what_was_spent_and_who_was_left_out(best: BestRecord)
         f"{choice.num_known} kept checkpoints: the leading 3 (1 other left out) in 2 rounds, 260 more episodes "
         "(50,000 of at most 250,000 env steps); 1 other scored the same to the last episode"
     )
+    longer = choice.model_copy(update={"num_env_steps": 260_000})
+    assert "(260,000 in place of 250,000 env steps)" in chosen_from(longer)
     alone = choice.model_copy(update={"candidates": choice.candidates[:1], "num_known": 1, "num_rounds": 0})
     assert chosen_from(alone) == "1 kept checkpoint; with one candidate nothing more was played"
 

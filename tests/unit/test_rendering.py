@@ -27,7 +27,9 @@ def _nothing_is_known_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> Iterat
     rendering._mujoco_backend.cache_clear()
 
 
-def draw_where(monkeypatch: pytest.MonkeyPatch, *backends: str, imported: bool = True) -> list[str]:
+def draw_where(
+    monkeypatch: pytest.MonkeyPatch, *backends: str, imported: bool = True, with_dm_control: bool = False
+) -> list[str]:
     """Prepare to draw where these backends work, and return which ones were tried."""
     tried: list[str] = []
 
@@ -36,6 +38,7 @@ def draw_where(monkeypatch: pytest.MonkeyPatch, *backends: str, imported: bool =
         return backend in backends
 
     monkeypatch.setattr(rendering, "_draws", draws)
+    monkeypatch.setattr(rendering, "find_spec", {"dm_control": with_dm_control}.get)
     if imported:
         monkeypatch.setitem(sys.modules, "mujoco", types.ModuleType("mujoco"))
     else:
@@ -79,6 +82,35 @@ def test_what_the_user_has_set_stays(monkeypatch: pytest.MonkeyPatch, name: str)
 def test_who_draws_no_robot_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert draw_where(monkeypatch, "egl", imported=False) == []
     assert "MUJOCO_GL" not in os.environ
+
+
+def test_what_chooses_when_it_is_imported_finds_the_choice_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert draw_where(monkeypatch, "egl", imported=False, with_dm_control=True) == ["egl"]
+    assert os.environ["MUJOCO_GL"] == "egl"
+
+
+@pytest.mark.parametrize(("module", "found"), [("chooses_early:", "'egl'"), ("", "None")])
+def test_the_choice_is_made_before_a_module_that_may_be_drawn_later(tmp_path: Path, module: str, found: str) -> None:
+    lines = ["import os", "import gymnasium as gym", "from gymnasium.envs.classic_control import CartPoleEnv"]
+    lines += ["given = os.environ.get('MUJOCO_GL')", "class Early(CartPoleEnv):"]
+    lines += ["    def __init__(self): raise ValueError(repr(given))", "gym.register('Early-v0', Early)"]
+    (tmp_path / "chooses_early.py").write_text("\n".join(lines) + "\n")
+    (tmp_path / "dm_control").mkdir()
+    (tmp_path / "dm_control" / "__init__.py").touch()
+    program = f"""
+from policies.envs import rendering
+
+rendering._draws = lambda backend: True
+from policies.guard import child
+
+asked = {{"folders": ["."], "module_folders": [], "modules": ["chooses_early"], "job": "check_env"}}
+env_id = "{module}Early-v0"
+if not {module!r}:
+    import chooses_early
+print(child._answer({{**asked, "arguments": {{"env_id": env_id, "env_args": {{}}, "algorithm": None}}}}, None))
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert f"ValueError: {found}" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize(

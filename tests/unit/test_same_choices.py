@@ -140,3 +140,58 @@ def test_so_may_that_of_a_policy_file(tmp_path: Path) -> None:
 def test_another_tuple_is_no_mask(mask: Any) -> None:
     with pytest.raises(EnvError, match=r"there are 5 actions to allow, of the choices \[2, 3\]"):
         make_env(ENV, {"mask": mask})
+
+
+class _Vector(spaces.Box):
+    """An environment's own class of vectors; so are the others."""
+
+
+class _Choice(spaces.Discrete[Any]):
+    pass
+
+
+class _SeveralChoices(spaces.MultiDiscrete):
+    pass
+
+
+class _Members(spaces.Dict):
+    pass
+
+
+class OwnClasses(gym.Env[Any, Any]):
+    """Its spaces are of classes of its own."""
+
+    def __init__(self, observed: str = "vector", acts: str = "choice") -> None:
+        vector = _Vector(-1, 1, (3,), np.float32)
+        self.observation_space = {
+            "vector": vector, "choice": _Choice(4), "members": _Members({"a": vector, "b": _Choice(2)}),
+        }[observed]  # fmt: skip
+        self.action_space = {
+            "choice": _Choice(3), "choices": _SeveralChoices([3, 2]), "vector": _Vector(-1, 2, (2,), np.float32),
+            "members": _Members({"a": _Choice(3), "b": _Choice(2)}),
+        }[acts]  # fmt: skip
+        self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        self.steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), action
+        self.steps += 1
+        return self.observation_space.sample(), 1.0, self.steps == 5, False, {}
+
+
+@pytest.mark.parametrize("observed", ["vector", "choice", "members"])
+@pytest.mark.parametrize("acts", ["choice", "choices", "vector", "members"])
+def test_a_class_of_spaces_of_the_envs_own_is_what_it_comes_from(tmp_path: Path, observed: str, acts: str) -> None:
+    args = {"observed": observed, "acts": acts}
+    with registered("TestOwnClasses-v0", OwnClasses):
+        info = check_env("TestOwnClasses-v0", args, "ppo")
+        made = (info.observation_space, info.action_space)
+        member = new_member("t0000", PPOHyperparams(hidden_sizes=(8,), num_envs=4), 3, *made)
+        save_policy(portable_policy(member, *made, env_id=info.env_id, env_args=args, training={}), tmp_path)
+        for policy in (load_policy(tmp_path), RandomPolicy.for_env(info.env_id, args)):
+            assert evaluate_policy(policy, env_id=info.env_id, env_args=args, seeds=[0, 1]).lengths == (5, 5)

@@ -112,6 +112,25 @@ def test_env_steps_of_all_are_within_the_budget_though_good_episodes_are_long() 
     assert len(rejects.standings[0].returns) > 2 * len(rejects.standings[-1].returns)
 
 
+def test_a_first_episode_that_is_short_does_not_make_the_round_cost_many_times_the_budget() -> None:
+    class Varied(Player):
+        def __call__(self, numbers: Sequence[int], first: int, count: int) -> list[Played]:
+            lengths = tuple(500 if index % 10 else 10 for index in range(first, first + count))
+            return [
+                Episodes(played.seeds, played.returns, lengths)
+                for played in super().__call__(numbers, first, count)
+                if isinstance(played, Episodes)
+            ]
+
+    player = Varied(lambda number, _: float(number))
+    rejects = run(player, [0.0] * 2, max_episodes=200, max_env_steps=20_000)
+    assert 0.8 * 20_000 < rejects.num_env_steps < 1.1 * 20_000
+    assert len(player.asked) <= 6
+    # Where episodes are equally long it is as many as the first makes expect: 20,000 env steps are 40 episodes.
+    rejects = run(Player(lambda number, _: float(number), 500), [0.0] * 2, max_episodes=200, max_env_steps=20_000)
+    assert rejects.num_episodes == 2 * (40 - 2) // 2
+
+
 @pytest.mark.parametrize("budget", [{"max_episodes": 0}, {"max_env_steps": 0}])
 def test_without_a_budget_the_evaluation_decides_and_nothing_is_played(budget: dict[str, int]) -> None:
     player = Player(lambda *_: 0.0)
