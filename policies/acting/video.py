@@ -24,7 +24,7 @@ from policies.acting.movies import GifWriter, Mp4Writer, fitted
 from policies.acting.policy import Policy
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
-from policies.envs.rendering import draw_without_display
+from policies.envs.rendering import display_hint, draw_without_display
 from policies.errors import EnvError, SpecError, said_by
 
 _HOLD_S = 1.0  # the last picture stays, so that the final return can be read
@@ -190,9 +190,11 @@ class _Stage:
         try:
             frame = np.asarray(self._env.render())
         except Exception as error:  # an env may raise anything
+            said = said_by(error)
             raise EnvError(
-                f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
-                "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
+                f"{env_id} cannot be drawn: {type(error).__name__}: {said}.",
+                display_hint(said)
+                or "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
                 "libosmesa6).",
             ) from error
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:

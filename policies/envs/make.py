@@ -32,7 +32,7 @@ from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_b
 from policies.envs.mujoco_warnings import say_each_once
 from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of, sizes_of
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
-from policies.envs.rendering import draw_without_display
+from policies.envs.rendering import display_hint, draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
 from policies.envs.wrappers import FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
@@ -341,7 +341,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
         return EnvError(message, "Install it, on every machine that runs trials: pip install Box2D==2.3.10")
     if isinstance(error, (ImportError, gym.error.DependencyNotInstalled)):
         return EnvError(message, "Install the package that the message names, on every machine that runs trials.")
-    return EnvError(message, "Check the env's arguments against its documentation.")
+    return EnvError(message, display_hint(detail) or "Check the env's arguments against its documentation.")
 
 
 def _check_observation_space(info: EnvInfo) -> None:

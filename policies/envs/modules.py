@@ -23,6 +23,7 @@ from typing import Any
 
 from policies.arguments import checked
 from policies.envs.faults import is_of_env
+from policies.envs.rendering import display_hint
 from policies.errors import SpecError, said_by
 
 ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
@@ -162,9 +163,10 @@ def _is_part(missing: str | None, module: str) -> bool:
 
 
 def _failed(module: str, error: BaseException) -> SpecError:
+    said = said_by(error)
     return SpecError(
-        f"The module {module!r} cannot be imported: {type(error).__name__}: {said_by(error)}.",
-        f'Try `python -c "import {module}"`, and mend what it says.',
+        f"The module {module!r} cannot be imported: {type(error).__name__}: {said}.",
+        display_hint(said) or f'Try `python -c "import {module}"`, and mend what it says.',
     )
 
 

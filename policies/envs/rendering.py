@@ -25,7 +25,7 @@ def draw_without_display() -> None:
     """
     # Otherwise pygame prints a greeting on standard output and connects to a display.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if not _lacks_display():
         return
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
@@ -33,6 +33,19 @@ def draw_without_display() -> None:
         return
     if (name := _mujoco_backend()) is not None:
         os.environ[_MUJOCO_GL] = name
+
+
+def display_hint(said: str) -> str | None:
+    """Return what to do about an error that speaks of a display on a machine that has none; None: it is no such error."""
+    if not (_lacks_display() and "display" in said.lower()):
+        return None
+    return (
+        "It wants a display, and there is none here: `xvfb-run -a tune-jobs ...` gives it one (Debian's xvfb, xauth)."
+    )
+
+
+def _lacks_display() -> bool:
+    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 @cache

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from policies.acting.policy import RandomPolicy
+from policies.acting.video import record_video
 from policies.envs import rendering
 from policies.envs.rendering import draw_without_display
+from policies.errors import EnvError
 
 VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "SDL_AUDIODRIVER", "MUJOCO_GL")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only on Linux are there machines without a display")
@@ -160,3 +163,26 @@ env.close()
     # What Mesa says of this machine's drivers is its own.
     said = [line for line in done.stderr.splitlines() if not line.startswith(("libEGL", "MESA"))]
     assert (done.stdout, said) == ("(480, 480, 3) True\n", [])
+
+
+@pytest.mark.parametrize("display", [None, ":0"])
+@pytest.mark.parametrize("where", ["import", "constructor", "render", "another error"])
+def test_who_wants_a_display_is_told_what_gives_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, where: str, display: str | None
+) -> None:
+    said = "what broke" if where == "another error" else "Cannot connect to display None"
+    lines = ["import gymnasium as gym", "from gymnasium.envs.classic_control import CartPoleEnv"]
+    lines += ["class Window(CartPoleEnv):", "    def __init__(self, render_mode=None):"]
+    fails = f"raise Exception({said!r})"
+    lines += ["        super().__init__(render_mode)" if where == "render" else f"        {fails}"]
+    lines += ["    def render(self):", f"        {fails}", "gym.register('Window-v0', Window)"]
+    name = f"wants_a_window_{where.replace(' ', '_')}_{'with' if display else 'without'}"
+    (tmp_path / f"{name}.py").write_text("\n".join([fails] * (where == "import") + lines) + "\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("policies.envs.modules._allowed", {name})
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(EnvError, match=said) as failure:
+        record_video(RandomPolicy.for_env("CartPole-v1"), env_id=f"{name}:Window-v0", seeds=0)
+    assert ("xvfb-run" in failure.value.hint) == (display is None and where != "another error")
+    assert failure.value.hint
