@@ -36,7 +36,7 @@ def draw_without_display() -> None:
 
 
 def display_hint(said: str) -> str | None:
-    """Return what to do about an error that speaks of a display on a machine that has none; None: it is no such error."""
+    """Return what to do about an error that speaks of a display on a machine without one; None: it is none such."""
     if not (_lacks_display() and "display" in said.lower()):
         return None
     return (
