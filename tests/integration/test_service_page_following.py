@@ -100,7 +100,9 @@ def test_a_page_whose_events_are_refused_asks_less_and_less_often(browser: webdr
         page.says(".trials-card", "3 trials")
         page.says("#link-state", "Not connected")
         first, second, third = page.wait("return window.moments.length > 2 && window.moments.slice(0, 3)")
-        assert third - second > 1.6 * (second - first)
+        # It waits a second, then two. A busy machine makes each longer, so that they are not compared with each other.
+        assert second - first > 950
+        assert third - second > 1_950
 
 
 def test_a_sweep_that_takes_long_to_load_is_loaded_once(
