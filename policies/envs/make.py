@@ -35,7 +35,7 @@ from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import display_hint, draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
-from policies.envs.wrappers import FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
+from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
 
@@ -244,6 +244,8 @@ def make_vector_env(
 def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec, dict[str, Any], ObservationWrappers]:
     """Return the normalised id, the registry entry, the constructor's arguments, and the wrappers for the env."""
     kwargs = copy.deepcopy(dict(env_args or {}))
+    if kwargs.get(PIXELS):
+        draw_without_display()
     with calls.inside(Call.IMPORT):
         env_id, spec = find_env(env_id)
         wrappers = ObservationWrappers.take_from(kwargs)

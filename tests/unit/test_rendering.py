@@ -92,28 +92,53 @@ def test_what_chooses_when_it_is_imported_finds_the_choice_made(monkeypatch: pyt
     assert os.environ["MUJOCO_GL"] == "egl"
 
 
-@pytest.mark.parametrize(("module", "found"), [("chooses_early:", "'egl'"), ("", "None")])
-def test_the_choice_is_made_before_a_module_that_may_be_drawn_later(tmp_path: Path, module: str, found: str) -> None:
-    lines = ["import os", "import gymnasium as gym", "from gymnasium.envs.classic_control import CartPoleEnv"]
-    lines += ["given = os.environ.get('MUJOCO_GL')", "class Early(CartPoleEnv):"]
-    lines += ["    def __init__(self): raise ValueError(repr(given))", "gym.register('Early-v0', Early)"]
-    (tmp_path / "chooses_early.py").write_text("\n".join(lines) + "\n")
-    (tmp_path / "dm_control").mkdir()
-    (tmp_path / "dm_control" / "__init__.py").touch()
-    program = f"""
-from policies.envs import rendering
+EARLY = """
+import os
+import gymnasium as gym
+from gymnasium.envs.classic_control import CartPoleEnv
 
-rendering._draws = lambda backend: True
+given = os.environ.get("MUJOCO_GL")
+
+class Early(CartPoleEnv):
+    def __init__(self, render_mode=None):
+        raise ValueError(repr(given))
+
+gym.register("Early-v0", Early)
+"""
+"""A module that chooses what it draws with when it is imported."""
+IN_CHILD = """
 from policies.guard import child
 
-asked = {{"folders": ["."], "module_folders": [], "modules": ["chooses_early"], "job": "check_env"}}
-env_id = "{module}Early-v0"
-if not {module!r}:
-    import chooses_early
-print(child._answer({{**asked, "arguments": {{"env_id": env_id, "env_args": {{}}, "algorithm": None}}}}, None))
+arguments = {"env_id": "%sEarly-v0", "env_args": {}, "algorithm": None}
+asked = {"folders": ["."], "module_folders": [], "modules": ["chooses_early"], "job": "check_env"}
+print(child._answer({**asked, "arguments": arguments}, None))
 """
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert f"ValueError: {found}" in done.stdout, done.stderr
+IN_TRIAL = """
+from policies.envs.make import make_env
+from policies.envs.modules import allow_modules
+
+allow_modules(["chooses_early"])
+make_env("chooses_early:Early-v0", {"pixels": %s})
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "found"),
+    [
+        # What is evaluated there may be filmed later.
+        (IN_CHILD % "chooses_early:", "'egl'"),
+        ("import chooses_early" + IN_CHILD % "", "None"),
+        (IN_TRIAL % True, "'egl'"),
+        (IN_TRIAL % False, "None"),
+    ],
+)
+def test_the_choice_is_made_before_a_module_that_may_be_drawn(tmp_path: Path, program: str, found: str) -> None:
+    (tmp_path / "chooses_early.py").write_text(EARLY)
+    (tmp_path / "dm_control").mkdir()
+    (tmp_path / "dm_control" / "__init__.py").touch()
+    code = "from policies.envs import rendering\nrendering._draws = lambda backend: True\n" + program
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert f"ValueError: {found}" in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(
