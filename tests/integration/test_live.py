@@ -352,3 +352,20 @@ def test_what_finishing_does_now_takes_the_place_of_what_it_did(*, on_terminal: 
     os.close(ours)
     assert process.returncode == 0
     assert -1 < seen.rfind(b"choosing") < seen.find(b"confirming")
+
+
+def test_on_a_terminal_a_name_with_brackets_is_shown_as_it_is() -> None:
+    ours, theirs = pty.openpty()
+    code = FINISHING.replace('"mine"', '"./of [/b] [red]mine"')
+    command = [sys.executable, "-c", code, "1000", "auto"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=theirs, start_new_session=True) as process:
+        os.close(theirs)
+        seen, until = b"", time.monotonic() + 60
+        with contextlib.suppress(OSError):  # the terminal's end, on Linux
+            while b"./of [/b] [red]mine: filming" not in seen and time.monotonic() < until:
+                seen += os.read(ours, 1_000)
+        assert process.stdin is not None
+        process.stdin.close()
+    os.close(ours)
+    assert process.returncode == 0
+    assert b"./of [/b] [red]mine: filming" in seen

@@ -13,6 +13,7 @@ from typing import IO
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 from rich.spinner import Spinner
+from rich.text import Text
 
 from analysis.wording import duration
 from tune_jobs.process.streams import patient_stream, quiet
@@ -122,7 +123,8 @@ def working(name: str, what: str, progress: str) -> Iterator[Say]:
     def say(present: str) -> None:
         nonlocal what
         what = present
-        spinner.update(text=f"{name}: {what} ...")
+        # Not a plain string, in which rich would take what a path has in brackets for a style.
+        spinner.update(text=Text(f"{name}: {what} ..."))
 
     say(what)
     if progress == "none":
