@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from policies.envs.flat import FlatBox
+from policies.envs.flat import FlatBox, named
 
 _HOW = "Wrap it in a module of your own, as 'Spaces' in docs/guides/own-environment.md shows"
 _MAX_COMBINATIONS = 10_000
@@ -61,6 +61,15 @@ def channels_last_hint(env_id: str, space: gym.Space[Any], shape: tuple[int, ...
     box = f"gymnasium.spaces.Box({low}, {high}, {(*shape[1:], shape[0])}, numpy.{space.dtype})"
     move = "lambda image: numpy.moveaxis(image, 0, -1)"
     return f"{_HOW}: `gymnasium.wrappers.TransformObservation({_make(env_id)}, {move}, {box})` puts the channels last."
+
+
+def image_alone_hint(env_id: str, keys: tuple[Any, ...]) -> str:
+    """Suggest what observes one member of Dict or Tuple observations, an image, alone; the keys lead to it."""
+    env, member = _make(env_id), named(keys, "")
+    alone = (
+        f"gymnasium.wrappers.TransformObservation({env}, lambda seen: seen{member}, {env}.observation_space{member})"
+    )
+    return f"{_HOW}: `{alone}` observes the image alone."
 
 
 def _number(value: Any) -> str:

@@ -17,6 +17,8 @@ from policies.envs.make import check_env, make_env
 from policies.envs.modules import allow_modules
 from policies.errors import EnvError
 from policies.hyperparams import Algorithm
+from tune_jobs.plan.env_notes import env_notes
+from tune_jobs.spec.file import load_spec
 
 NUMBERS = spaces.Box(-1, 1, (3,), np.float32)
 
@@ -171,3 +173,53 @@ def test_a_class_of_a_module_is_made_as_such() -> None:
     from policies.envs.space_hints import observation_hint
 
     assert "wrappers.FlattenObservation(my_envs.Walk())" in observation_hint("my_envs:Walk", spaces.Text(2))
+
+
+SCREEN = spaces.Box(0, 255, (40, 30, 3), np.uint8)
+SMALL = spaces.Box(0, 255, (20, 30, 3), np.uint8)
+HEALTH = spaces.Box(0, 1, (2,), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("observations", "place", "size"),
+    [
+        (spaces.Dict({"health": HEALTH, "map": SMALL, "screen": SCREEN}), "observation['screen']", "3,600"),
+        (spaces.Tuple((HEALTH, spaces.Dict({"eye": SCREEN}))), "observation[1]['eye']", "3,600"),
+    ],
+)
+def test_the_wrapper_that_a_plan_names_observes_the_image_alone(
+    observations: gym.Space[Any], place: str, size: str, own_module: OwnModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(env_modules, "_allowed", set())
+    monkeypatch.setitem(gym.registry, "Odd-v0", None)
+    del gym.registry["Odd-v0"]
+    gym.register("Odd-v0", cast("Any", lambda: Odd(observations, spaces.Discrete(2))))
+    spec = load_spec({"env": "Odd-v0", "algorithm": "ppo"})
+    of_vectors, of_image = env_notes(spec, check_env("Odd-v0", None, "ppo"))
+    assert "are made vectors of shape" in of_vectors
+    assert of_image.startswith(f"{size} numbers of these vectors are those of an image, {place}:")
+    (expression,) = re.findall("`(.+?)`", of_image)
+    own_module(expression)
+    info = check_env("wrapped_envs:Wrapped-v0", None, "ppo")
+    assert info.observes_images
+    assert info.observation_space == SCREEN
+    assert make_env("wrapped_envs:Wrapped-v0").reset()[0].shape == SCREEN.shape
+
+
+@pytest.mark.parametrize(
+    "observations",
+    [
+        spaces.Dict({"health": HEALTH, "map": SMALL}),
+        spaces.Dict({"grid": spaces.Box(-1, 1, (40, 30, 3), np.float32)}),
+        spaces.Dict({"letters": spaces.Box(0, 255, (80, 80), np.uint8)}),
+        spaces.Dict({"texts": spaces.Box(0, 255, (21, 79, 80), np.uint8)}),
+    ],
+)
+def test_of_what_is_no_large_image_nothing_is_said(
+    observations: gym.Space[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(gym.registry, "Odd-v0", None)
+    del gym.registry["Odd-v0"]
+    gym.register("Odd-v0", cast("Any", lambda: Odd(observations, spaces.Discrete(2))))
+    (note,) = env_notes(load_spec({"env": "Odd-v0", "algorithm": "ppo"}), check_env("Odd-v0", None, "ppo"))
+    assert "are made vectors of shape" in note

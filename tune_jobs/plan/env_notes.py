@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
 from analysis.wording import counted
-from policies.envs.flat import FlatBox
+from policies.envs.flat import FlatBox, leaves, named
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices, is_made
+from policies.envs.space_hints import image_alone_hint
 from policies.errors import shortened
 from tune_jobs.plan.env_checks import channels_hint
 from tune_jobs.spec.sweep_spec import SweepSpec
+
+_IMAGE = 3
+"""The dimensions of an image."""
+_MOST_CHANNELS = 16
+"""Of an image: four frames in colour. NetHack's texts are of three dimensions, too, none of which is as small."""
+_FEW_NUMBERS = 3_000
+"""An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
 
 
 def env_notes(spec: SweepSpec, env: EnvInfo) -> list[str]:
@@ -19,6 +33,8 @@ def env_notes(spec: SweepSpec, env: EnvInfo) -> list[str]:
     if isinstance(seen, FlatBox):
         kind = "images of shape" if env.observes_images else "vectors of shape"
         notes.append(f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}.")
+        if spec.rl_module is None and (note := _note_on_image(env, seen.original)):
+            notes.append(note)
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.
         notes.append(f"Convolutions go over the first two dimensions of images. {hint}")
@@ -42,3 +58,21 @@ def env_notes(spec: SweepSpec, env: EnvInfo) -> list[str]:
             "trials may end before they solve it."
         )
     return notes
+
+
+def _note_on_image(env: EnvInfo, space: gym.Space[Any]) -> str | None:
+    """Return a note on the largest image among members that are made one vector; None: none is large."""
+    sizes = {keys: math.prod(leaf.shape) for keys, leaf in leaves(space, ()) if keys and _is_image(leaf)}
+    keys = max(sizes, key=lambda each: sizes[each], default=())
+    if not keys or sizes[keys] < _FEW_NUMBERS:
+        return None
+    return (
+        f"{sizes[keys]:,} numbers of these vectors are those of an image, {named(keys)}: networks see no pixel beside "
+        f"another, and have a weight for every number and unit. {image_alone_hint(env.env_id, keys)}"
+    )
+
+
+def _is_image(space: gym.Space[Any]) -> bool:
+    is_of_bytes = isinstance(space, gym.spaces.Box) and space.dtype == np.uint8
+    shape = space.shape or ()
+    return is_of_bytes and len(shape) == _IMAGE and min(shape[0], shape[-1]) <= _MOST_CHANNELS
