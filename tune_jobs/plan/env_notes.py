@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -72,7 +72,7 @@ def _note_on_image(env: EnvInfo, space: gym.Space[Any]) -> str | None:
     )
 
 
-def _is_image(space: gym.Space[Any]) -> bool:
+def _is_image(space: gym.Space[Any]) -> TypeGuard[gym.spaces.Box]:
     is_of_bytes = isinstance(space, gym.spaces.Box) and space.dtype == np.uint8
     shape = space.shape or ()
     return is_of_bytes and len(shape) == _IMAGE and min(shape[0], shape[-1]) <= _MOST_CHANNELS
