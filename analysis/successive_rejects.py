@@ -12,7 +12,7 @@ Source:
     and n episodes in all, each policy that is left has played n_k = ceil((n - K) / (L (K + 1 - k))) episodes at the end
     of round k, L = 1/2 + 1/2 + 1/3 + ... + 1/K. Two things differ. An exact tie is not broken while episodes are left:
     the tied play on. And n is estimated anew before each round, because the env steps of an episode are known only
-    when it was played.
+    when it was played; so a round is played in several parts, too.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Play = Callable[[Sequence[int], int, int], Sequence[Played]]
 
 NOT_FINITE = "the mean of its returns is not a finite number"
 TIED = "a tie, from more env steps"
-GROWTH = 4
+_GROWTH = 4
 """How many times as many episodes as are known are played before it is asked again what one takes."""
 
 
@@ -154,10 +154,10 @@ class _Rounds:
         if number == 1:
             # The first episode of each tells about how long episodes are.
             self._play(min(1, self._affordable()))
-        target = len(self.running[0].returns) + self._wanted(number)
         known = len(self.running[0].returns)
+        target = known + self._wanted(number)
         # Not all at once: a few short episodes say little about those to come, which may take many times as long.
-        while self._play(min(target - known, self._affordable(), GROWTH * max(1, known))):
+        while self._play(min(target - known, self._affordable(), _GROWTH * max(1, known))):
             known = len(self.running[0].returns)
 
     def _wanted(self, number: int) -> int:

@@ -37,7 +37,8 @@ MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
 MAX_ENVS = 16
 """The most environments that are open at once, so that networks get batches."""
-_KINDS = (MaskedBox, FlatBox, Numbers, gym.spaces.Box, gym.spaces.Discrete, Choices)
+_KINDS = (MaskedBox, FlatBox, Numbers, gym.spaces.Box, gym.spaces.Discrete)
+"""The spaces of which an env may have classes of its own, behind those made here, which are Boxes too."""
 
 
 @dataclass(frozen=True)

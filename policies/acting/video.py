@@ -190,10 +190,9 @@ class _Stage:
         try:
             frame = np.asarray(self._env.render())
         except Exception as error:  # an env may raise anything
-            said = said_by(error)
             raise EnvError(
-                f"{env_id} cannot be drawn: {type(error).__name__}: {said}.",
-                display_hint(said)
+                f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
+                display_hint(error)
                 or "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
                 "libosmesa6).",
             ) from error

@@ -32,7 +32,7 @@ from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_b
 from policies.envs.mujoco_warnings import say_each_once
 from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of, sizes_of
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
-from policies.envs.rendering import display_hint, draw_without_display
+from policies.envs.rendering import choose_before_import, display_hint, draw_without_display
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
 from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
@@ -245,7 +245,7 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
     """Return the normalised id, the registry entry, the constructor's arguments, and the wrappers for the env."""
     kwargs = copy.deepcopy(dict(env_args or {}))
     if kwargs.get(PIXELS):
-        draw_without_display()
+        choose_before_import()
     with calls.inside(Call.IMPORT):
         env_id, spec = find_env(env_id)
         wrappers = ObservationWrappers.take_from(kwargs)
@@ -343,7 +343,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
         return EnvError(message, "Install it, on every machine that runs trials: pip install Box2D==2.3.10")
     if isinstance(error, (ImportError, gym.error.DependencyNotInstalled)):
         return EnvError(message, "Install the package that the message names, on every machine that runs trials.")
-    return EnvError(message, display_hint(detail) or "Check the env's arguments against its documentation.")
+    return EnvError(message, display_hint(error) or "Check the env's arguments against its documentation.")
 
 
 def _check_observation_space(info: EnvInfo) -> None:

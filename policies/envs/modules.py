@@ -163,10 +163,9 @@ def _is_part(missing: str | None, module: str) -> bool:
 
 
 def _failed(module: str, error: BaseException) -> SpecError:
-    said = said_by(error)
     return SpecError(
-        f"The module {module!r} cannot be imported: {type(error).__name__}: {said}.",
-        display_hint(said) or f'Try `python -c "import {module}"`, and mend what it says.',
+        f"The module {module!r} cannot be imported: {type(error).__name__}: {said_by(error)}.",
+        display_hint(error) or f'Try `python -c "import {module}"`, and mend what it says.',
     )
 
 

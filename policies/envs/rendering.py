@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from functools import cache
@@ -13,6 +14,8 @@ _MUJOCO_BACKENDS = ("egl", "osmesa")
 """What MuJoCo draws with in memory, on a GPU if there is one, then on CPUs."""
 _CHOOSES_WHEN_IMPORTED = "dm_control"
 """A package that draws with MuJoCo's backends, by the variable's value when it is imported."""
+_DISPLAY = re.compile("(?i:display)(?![_a-z])")
+"""In the name or the words of an error; no part of another word, as in display_mode."""
 _TRIAL_TIMEOUT_S = 30.0
 
 
@@ -21,7 +24,7 @@ def draw_without_display() -> None:
 
     MuJoCo's part is done once the process has imported it: whoever draws nothing of it need not wait for a trial of its
     libraries, which takes half a second. Where dm_control is installed, it is done in any case, as that would be too
-    late; so call it before an env's module is imported, too, if the env may be drawn later.
+    late.
     """
     # Otherwise pygame prints a greeting on standard output and connects to a display.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -29,15 +32,27 @@ def draw_without_display() -> None:
         return
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
-    if _MUJOCO_GL in os.environ or not ("mujoco" in sys.modules or find_spec(_CHOOSES_WHEN_IMPORTED)):
-        return
-    if (name := _mujoco_backend()) is not None:
+    if "mujoco" in sys.modules or find_spec(_CHOOSES_WHEN_IMPORTED):
+        _choose_backend()
+
+
+def choose_before_import() -> None:
+    """Let what an env's module imports find its way to draw chosen; call it before that, if the env may be drawn later.
+
+    Nothing is done where MuJoCo is imported already: `draw_without_display` does that where something is drawn.
+    """
+    if _lacks_display() and "mujoco" not in sys.modules and find_spec(_CHOOSES_WHEN_IMPORTED):
+        _choose_backend()
+
+
+def _choose_backend() -> None:
+    if _MUJOCO_GL not in os.environ and (name := _mujoco_backend()) is not None:
         os.environ[_MUJOCO_GL] = name
 
 
-def display_hint(said: str) -> str | None:
+def display_hint(error: BaseException) -> str | None:
     """Return what to do about an error that speaks of a display on a machine without one; None: it is none such."""
-    if not (_lacks_display() and "display" in said.lower()):
+    if not (_lacks_display() and _DISPLAY.search(f"{type(error).__name__} {error}")):
         return None
     return (
         "It wants a display, and there is none here: `xvfb-run -a tune-jobs ...` gives it one (Debian's xvfb, xauth)."

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from policies.envs import calls
 from policies.envs import faults as env_faults
 from policies.envs import modules as env_modules
-from policies.envs.rendering import draw_without_display
+from policies.envs.rendering import choose_before_import
 from policies.errors import EnvFailedError, TuneJobsError, said_by
 
 if TYPE_CHECKING:
@@ -109,8 +109,8 @@ def _see(asked: Mapping[str, Any]) -> None:
     missing = [folder for folder in (*asked["folders"], *asked["module_folders"]) if folder not in sys.path]
     sys.path[:0] = missing
     if ":" in asked["arguments"]["env_id"]:
-        # What the module imports may decide there and then what it draws with, and a later job may be a film.
-        draw_without_display()
+        # A later job may be a film.
+        choose_before_import()
 
 
 # -- jobs

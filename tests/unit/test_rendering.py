@@ -12,7 +12,7 @@ import pytest
 from policies.acting.policy import RandomPolicy
 from policies.acting.video import record_video
 from policies.envs import rendering
-from policies.envs.rendering import draw_without_display
+from policies.envs.rendering import choose_before_import, display_hint, draw_without_display
 from policies.errors import EnvError
 
 VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "SDL_AUDIODRIVER", "MUJOCO_GL")
@@ -90,6 +90,18 @@ def test_who_draws_no_robot_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -
 def test_what_chooses_when_it_is_imported_finds_the_choice_made(monkeypatch: pytest.MonkeyPatch) -> None:
     assert draw_where(monkeypatch, "egl", imported=False, with_dm_control=True) == ["egl"]
     assert os.environ["MUJOCO_GL"] == "egl"
+
+
+def test_before_an_import_nothing_is_tried_for_what_may_not_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_where(monkeypatch, with_dm_control=True)
+    rendering._mujoco_backend.cache_clear()
+    monkeypatch.setattr(rendering, "_draws", pytest.fail)
+    # What is imported may be told when something is drawn: a plan of a robot need not wait for that.
+    choose_before_import()
+    monkeypatch.delitem(sys.modules, "mujoco")
+    monkeypatch.setattr(rendering, "find_spec", lambda _: None)
+    choose_before_import()
+    assert "MUJOCO_GL" not in os.environ
 
 
 EARLY = """
@@ -211,3 +223,20 @@ def test_who_wants_a_display_is_told_what_gives_one(
         record_video(RandomPolicy.for_env("CartPole-v1"), env_id=f"{name}:Window-v0", seeds=0)
     assert ("xvfb-run" in failure.value.hint) == (display is None and where != "another error")
     assert failure.value.hint
+
+
+class NoSuchDisplayException(Exception):  # noqa: N818 (as pyglet calls it)
+    pass
+
+
+@pytest.mark.parametrize(
+    ("error", "hinted"),
+    [
+        (NoSuchDisplayException('Cannot connect to "None"'), True),
+        (OSError("X11: The DISPLAY environment variable is missing"), True),
+        (KeyError("display_mode"), False),
+        (ValueError("nothing is displayed"), False),
+    ],
+)
+def test_that_a_display_is_wanted_is_known_by_the_error_and_its_name(error: Exception, *, hinted: bool) -> None:
+    assert (display_hint(error) is not None) is hinted

@@ -223,3 +223,14 @@ def test_of_what_is_no_large_image_nothing_is_said(
     gym.register("Odd-v0", cast("Any", lambda: Odd(observations, spaces.Discrete(2))))
     (note,) = env_notes(load_spec({"env": "Odd-v0", "algorithm": "ppo"}), check_env("Odd-v0", None, "ppo"))
     assert "are made vectors of shape" in note
+
+
+def test_no_wrapper_is_named_that_would_lose_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Whatever is drawn of it, both actions are allowed.
+    members: dict[str, gym.Space[Any]] = {"action_mask": spaces.Box(1, 1, (2,), np.int8), "screen": SCREEN}
+    monkeypatch.setitem(gym.registry, "Odd-v0", None)
+    del gym.registry["Odd-v0"]
+    gym.register("Odd-v0", cast("Any", lambda: Odd(spaces.Dict(members), spaces.Discrete(2))))
+    notes = env_notes(load_spec({"env": "Odd-v0", "algorithm": "ppo"}), check_env("Odd-v0", None, "ppo"))
+    assert [note for note in notes if "observation['action_mask']" in note]
+    assert not [note for note in notes if "TransformObservation" in note]

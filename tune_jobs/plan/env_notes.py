@@ -33,7 +33,8 @@ def env_notes(spec: SweepSpec, env: EnvInfo) -> list[str]:
     if isinstance(seen, FlatBox):
         kind = "images of shape" if env.observes_images else "vectors of shape"
         notes.append(f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}.")
-        if spec.rl_module is None and (note := _note_on_image(env, seen.original)):
+        # Who observes the image alone would lose a mask that is a member beside it.
+        if spec.rl_module is None and env.mask is None and (note := _note_on_image(env, seen.original)):
             notes.append(note)
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.

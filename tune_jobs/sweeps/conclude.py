@@ -75,9 +75,8 @@ def choose_best(store: Sweep, num_episodes: int = 100, say: Callable[[str], None
 
     def played(policy: Policy, what: str) -> EvaluationRecord:
         return run_evaluation(
-            policy, env_id, env_args, seeds, timeout_s, num_processes=num_processes,
-            told=lambda begun: say(f"{what}: {episode_of(begun, num_episodes)}"),
-        )  # fmt: skip
+            policy, env_id, env_args, seeds, timeout_s, num_processes=num_processes, what=what, say=say
+        )
 
     confirmation = played(policy, "confirming the best policy")
     record = BestRecord(
@@ -97,12 +96,15 @@ def choose_best(store: Sweep, num_episodes: int = 100, say: Callable[[str], None
 @guarding()
 def run_evaluation(
     policy: Policy, env_id: str, env_args: dict[str, Any], seeds: Sequence[int], timeout_s: float, *,
-    num_processes: int, told: Callable[[int], None] = lambda _: None,
+    num_processes: int, what: str, say: Callable[[str], None],
 ) -> EvaluationRecord:  # fmt: skip
-    """Play a policy's greedy episodes, one per seed; the arguments are those of `evaluate_policy`."""
+    """Play a policy's greedy episodes, one per seed, and let `say` be told `what` is done, and how far it is.
+
+    The other arguments are those of `evaluate_policy`.
+    """
     episodes = evaluate_policy(
         policy, env_id=env_id, env_args=env_args, seeds=seeds, timeout_s=timeout_s, num_processes=num_processes,
-        told=told,
+        told=lambda begun: say(f"{what}: {episode_of(begun, len(seeds))}"),
     )  # fmt: skip
     return EvaluationRecord(
         policy=policy.description,
@@ -217,10 +219,7 @@ def evaluate(
     cpus = cpus_for_episodes(None)
 
     def played(policy: Policy, what: str) -> EvaluationRecord:
-        return run_evaluation(
-            policy, env_id, env_args, seeds, timeout_s, num_processes=cpus,
-            told=lambda begun: say(f"{what}: {episode_of(begun, num_episodes)}"),
-        )  # fmt: skip
+        return run_evaluation(policy, env_id, env_args, seeds, timeout_s, num_processes=cpus, what=what, say=say)
 
     record = played(source.policy, "playing")
     return record, played(random_policy(env_id, env_args, timeout_s), "playing at random, to compare with it")

@@ -36,9 +36,9 @@ from tune_jobs.sweeps.storage import choose_store, create_store, stem_of, storag
 from tune_jobs.sweeps.waiting import check_wait
 
 __all__ = [
-    "CreatedSweep", "Progress", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive",
-    "evaluate", "export", "extend", "figure", "importance", "inject", "launch", "list_sweeps", "replicate", "report",
-    "reproduce", "restore", "resume", "status", "stop", "study", "trials", "video",
+    "CreatedSweep", "SweepResult", "SweepStatus", "best", "compare", "create", "dataframe", "drive", "evaluate",
+    "export", "extend", "figure", "importance", "inject", "launch", "list_sweeps", "replicate", "report", "reproduce",
+    "restore", "resume", "status", "stop", "study", "trials", "video",
 ]  # fmt: skip
 
 
