@@ -9,6 +9,8 @@ import sys
 from functools import cache
 from importlib.util import find_spec
 
+from policies.errors import said_by
+
 _MUJOCO_GL = "MUJOCO_GL"
 _MUJOCO_BACKENDS = ("egl", "osmesa")
 """What MuJoCo draws with in memory, on a GPU if there is one, then on CPUs."""
@@ -52,7 +54,7 @@ def _choose_backend() -> None:
 
 def display_hint(error: BaseException) -> str | None:
     """Return what to do about an error that speaks of a display on a machine without one; None: it is none such."""
-    if not (_lacks_display() and _DISPLAY.search(f"{type(error).__name__} {error}")):
+    if not (_lacks_display() and _DISPLAY.search(f"{type(error).__name__} {said_by(error)}")):
         return None
     return (
         "It wants a display, and there is none here: `xvfb-run -a tune-jobs ...` gives it one (Debian's xvfb, xauth)."

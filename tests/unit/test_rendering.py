@@ -229,6 +229,11 @@ class NoSuchDisplayException(Exception):  # noqa: N818 (as pyglet calls it)
     pass
 
 
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
 @pytest.mark.parametrize(
     ("error", "hinted"),
     [
@@ -236,6 +241,7 @@ class NoSuchDisplayException(Exception):  # noqa: N818 (as pyglet calls it)
         (OSError("X11: The DISPLAY environment variable is missing"), True),
         (KeyError("display_mode"), False),
         (ValueError("nothing is displayed"), False),
+        (MuteError(), False),
     ],
 )
 def test_that_a_display_is_wanted_is_known_by_the_error_and_its_name(error: Exception, *, hinted: bool) -> None:
