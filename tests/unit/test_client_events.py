@@ -97,12 +97,15 @@ def test_after_a_lost_connection_what_came_meanwhile_comes_once(live: Live) -> N
     with Client(live.url) as direct, cutting_proxy(live.url) as proxy, Client(proxy.url) as client:
         listener = Listener(client.events("done"))
         listener.wait_for(lambda: listener.of("status"))
+        log = live.service.watching.sweep("done").log
         for number in range(2):
             proxy.is_away = True
             proxy.cut_all()
             for text in (f"early {number}", f"note {number}"):
+                known = log.last_id
                 direct.change("done", note=text)
-                time.sleep(1.2)
+                # The service looks from time to time, on a busy machine more rarely: each note is to be seen.
+                wait_until(lambda: log.last_id != known)  # noqa: B023
             proxy.is_away = False
             listener.wait_for(lambda: listener.of("status")[-1]["note"] == f"note {number}")  # noqa: B023
         assert [item["note"] for item in listener.of("status")] == ["", "early 0", "note 0", "early 1", "note 1"]
