@@ -14,6 +14,9 @@ from traceback import walk_tb
 from types import FrameType
 from typing import Any, NamedTuple
 
+from gymnasium.error import DependencyNotInstalled
+
+from policies.envs.rendering import display_hint
 from policies.errors import EnvFailedError, said_by
 
 _PACKAGE = PurePath(__file__).parents[1]
@@ -62,7 +65,7 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     Args:
         what: What failed, such as "CartPole-v1 raised an error in step()".
         error: What the env raised.
-        hint: What to do.
+        hint: What to do, if the error itself does not say.
 
     Raises:
         BaseException: The error itself, if it came from a signal to this process.
@@ -72,7 +75,18 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     detail = said_by(error)
     if (place := place_in_env(error)) is not None:
         detail += f" ({place})" if detail else f"at {place}"
-    return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint)
+    return EnvFailedError(
+        f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", known_hint(error) or hint
+    )
+
+
+def known_hint(error: BaseException) -> str | None:
+    """Return what to do about an error of an env's code that lacks a package or a display; None: another one."""
+    if (hint := display_hint(error)) is not None:
+        return hint
+    if isinstance(error, ImportError | DependencyNotInstalled):
+        return "Install the package that the message names, on every machine that runs trials."
+    return None
 
 
 def place_in_env(error: BaseException) -> Frame | None:

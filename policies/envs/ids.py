@@ -6,7 +6,10 @@ id such as `module:Env-v0` names, allowed or not.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
+from functools import partial
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -61,7 +64,9 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         guess = _nearest_ids(env_id, gym.registry)
         hint = "Correct the id, or install the package that registers it."
         own = allowed_modules()
-        if own or not guess:
+        if (home := _namespace_module(env_id)) is not None:
+            hint += f" If the module {home} registers it, that is written {home}:{env_id}."
+        elif own or not guess:
             example = own[0] if own else "my_envs"
             hint += f" What a module of your own registers is written module:id, as in {example}:Maze-v0."
         module, _, name = env_id.rpartition(".")
@@ -86,11 +91,15 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
     except SpecError as error:
         raise EnvError(f"The env id {env_id!r} names a module before its colon. {error.message}", error.hint) from error
     found = _find_registered(name)
-    if found is not None:
-        return f"{module_name}:{found}", gym.registry[found]
     thing: Any = getattr(module, name, None)
-    if isinstance(thing, type) and issubclass(thing, gym.Env):
-        return env_id, EnvSpec(env_id, entry_point=cast("EnvCreator", thing))
+    is_class = isinstance(thing, type) and issubclass(thing, gym.Env)
+    # A class of one's own may be called as an environment of another package is, without its version.
+    if found is not None and (not is_class or _is_registered_by(found, module_name, thing.__module__)):
+        return f"{module_name}:{found}", gym.registry[found]
+    if is_class:
+        # Gymnasium reads the class's metadata, which of a Wrapper is a property.
+        creator: Any = partial(thing) if isinstance(thing.metadata, property) else thing
+        return env_id, EnvSpec(env_id, entry_point=cast("EnvCreator", creator))
     classes = [
         name
         for name, value in vars(module).items()
@@ -101,6 +110,22 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
         f"name that is a gymnasium.Env.{_nearest_ids(name, [*classes, *gym.registry])}",
         "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
     )
+
+
+def _is_registered_by(env_id: str, *modules: str) -> bool:
+    """Whether the environment of a registered id is made by the package of one of these modules."""
+    entry = gym.registry[env_id].entry_point
+    maker = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    return maker.partition(".")[0] in {module.partition(".")[0] for module in modules}
+
+
+def _namespace_module(env_id: str) -> str | None:
+    """Return the module that is called as an id's namespace, as of gym_pusht/PushT-v0; None: there is none."""
+    name, slash, _ = env_id.replace("-", "_").partition("/")
+    with contextlib.suppress(ValueError):  # an entry of sys.modules that was not imported from anywhere
+        if slash and name.isidentifier() and find_spec(name) is not None:
+            return name
+    return None
 
 
 def _find_registered(env_id: str) -> str | None:

@@ -14,6 +14,7 @@ import copy
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -24,7 +25,7 @@ from policies.envs import atari, calls
 from policies.envs.calls import Call
 from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
-from policies.envs.faults import close_env, is_of_env, place_in_env
+from policies.envs.faults import close_env, is_of_env, known_hint, place_in_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
@@ -32,7 +33,7 @@ from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_b
 from policies.envs.mujoco_warnings import say_each_once
 from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of, sizes_of
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
-from policies.envs.rendering import choose_before_import, display_hint, draw_without_display
+from policies.envs.rendering import choose_before_import, draw_without_display, without_window
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
 from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
@@ -180,7 +181,7 @@ def make_env(
     try:
         with calls.inside(Call.CONSTRUCTOR):
             # The passive checker only prints warnings, at each env made, and slows every step.
-            env = gym.make(spec, disable_env_checker=True, **_game_args(env_id, spec, kwargs, wrappers))
+            env = _made(partial(gym.make, spec, disable_env_checker=True), env_id, spec, kwargs, wrappers)
         return calls.watch_env(wrappers.wrap(env, {**spec.kwargs, **kwargs}))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
@@ -221,13 +222,9 @@ def make_vector_env(
                 if wrappers.pixels:
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
                 given = {**spec.kwargs, **kwargs}
-                env = gym.make_vec(
-                    spec, num_envs=num_envs, vectorization_mode="sync", disable_env_checker=True,
-                    wrappers=(
-                        lambda game: wrappers.wrap_images(game, given), wrappers.wrap_mask, flattened, PlainSteps,
-                    ),
-                    **_game_args(env_id, spec, kwargs, wrappers),
-                )  # fmt: skip
+                around = lambda game: wrappers.wrap_images(game, given), wrappers.wrap_mask, flattened, PlainSteps
+                make_all = partial(gym.make_vec, vectorization_mode="sync", disable_env_checker=True, wrappers=around)
+                env = _made(partial(make_all, spec, num_envs=num_envs), env_id, spec, kwargs, wrappers)
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
@@ -254,9 +251,14 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
     return env_id, spec, kwargs, wrappers
 
 
-def _game_args(env_id: str, spec: EnvSpec, kwargs: dict[str, Any], wrappers: ObservationWrappers) -> dict[str, Any]:
-    """Return the constructor's arguments, as the wrappers need them."""
-    return kwargs if wrappers.atari is None else wrappers.atari.game_args(env_id, _creator(env_id, spec), kwargs)
+def _made(
+    make: Callable[..., Any], env_id: str, spec: EnvSpec, kwargs: dict[str, Any], wrappers: ObservationWrappers
+) -> Any:
+    """Make an environment, or several, of the constructor's arguments as the wrappers need them."""
+    creator = _creator(env_id, spec)
+    if wrappers.atari is not None:
+        kwargs = wrappers.atari.game_args(env_id, creator, kwargs)
+    return without_window(make, kwargs, creator, spec.kwargs)
 
 
 def _may_be_vectorised(env_id: str, spec: EnvSpec, wrappers: ObservationWrappers) -> bool:
@@ -341,9 +343,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
     if "box2d" in detail.lower():
         # gymnasium[box2d] asks for a source build; this wheel holds the same module.
         return EnvError(message, "Install it, on every machine that runs trials: pip install Box2D==2.3.10")
-    if isinstance(error, (ImportError, gym.error.DependencyNotInstalled)):
-        return EnvError(message, "Install the package that the message names, on every machine that runs trials.")
-    return EnvError(message, display_hint(error) or "Check the env's arguments against its documentation.")
+    return EnvError(message, known_hint(error) or "Check the env's arguments against its documentation.")
 
 
 def _check_observation_space(info: EnvInfo) -> None:

@@ -33,9 +33,9 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
         except ValueError:
             values = np.empty(0, dtype=object)
     if values.dtype.kind not in "biuf" or values.size != num:
-        raise MaskProblemError(f"not {num} zeros and ones, one for each action")
+        raise MaskProblemError(f"not {num} zeros and ones, one for each action{_if_numbers(values, sizes)}")
     if not ((values == 0) | (values == 1)).all():
-        raise MaskProblemError("not zeros and ones")
+        raise MaskProblemError(f"not zeros and ones{_if_numbers(values, sizes)}")
     checked = values.astype(np.float32)
     if len(sizes) == 1:
         if not checked.any():
@@ -46,6 +46,15 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
         number = int(np.flatnonzero(allowed == 0)[0])
         raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
     return checked
+
+
+def _if_numbers(values: NDArray[Any], sizes: tuple[int, ...]) -> str:
+    """Return what to do if what was given for a mask are the actions allowed, themselves; "": they are not."""
+    if len(sizes) > 1 or values.dtype.kind not in "iu" or len(set(values.tolist())) != values.size:
+        return ""
+    if not ((values >= 0) & (values < sizes[0])).all():
+        return ""
+    return "; if these are the actions that are allowed, let the environment or a wrapper make zeros and ones of them"
 
 
 @functools.cache

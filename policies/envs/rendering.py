@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.util import find_spec
+from typing import Any, TypeVar
 
 from policies.errors import said_by
 
+_Made = TypeVar("_Made")
+
+_RENDER_MODE = "render_mode"
 _MUJOCO_GL = "MUJOCO_GL"
 _MUJOCO_BACKENDS = ("egl", "osmesa")
 """What MuJoCo draws with in memory, on a GPU if there is one, then on CPUs."""
@@ -52,9 +59,38 @@ def _choose_backend() -> None:
         os.environ[_MUJOCO_GL] = name
 
 
+def without_window(
+    make: Callable[..., _Made],
+    env_args: Mapping[str, Any],
+    creator: Callable[..., Any] | None,
+    given: Mapping[str, Any],
+) -> _Made:
+    """Make an environment, or several, that open no window though "human" is the render mode they have by default.
+
+    Args:
+        make: Makes it of the arguments.
+        env_args: The arguments; with a render mode among them, they are taken as they are.
+        creator: The env's class, or the function that makes it; None: it is not known.
+        given: The arguments with which it is registered.
+    """
+    if {**_defaults(creator), **given, **env_args}.get(_RENDER_MODE) == "human" and _RENDER_MODE not in env_args:
+        with contextlib.suppress(Exception):  # what takes no such mode is made as it wants, or raises again
+            return make(**{**env_args, _RENDER_MODE: None})
+    return make(**env_args)
+
+
+def _defaults(creator: Callable[..., Any] | None) -> dict[str, Any]:
+    """Return the defaults of the parameters of what makes an env."""
+    parameters = inspect.signature(creator).parameters if creator is not None else {}
+    return {name: parameter.default for name, parameter in parameters.items()}
+
+
 def display_hint(error: BaseException) -> str | None:
     """Return what to do about an error that speaks of a display on a machine without one; None: it is none such."""
-    if not (_lacks_display() and _DISPLAY.search(f"{type(error).__name__} {said_by(error)}")):
+    # A module that is missing is missed with a display, too, whatever it is called.
+    if isinstance(error, ModuleNotFoundError) or not _lacks_display():
+        return None
+    if not _DISPLAY.search(f"{type(error).__name__} {said_by(error)}"):
         return None
     return (
         "It wants a display, and there is none here: `xvfb-run -a tune-jobs ...` gives it one (Debian's xvfb, xauth)."

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from click.testing import Result
 
@@ -47,6 +48,12 @@ class Walk(gym.Env):
     def step(self, action):
         self.ticks += 1
         return np.zeros(2, np.float32), 1.0, self.ticks >= self.length, False, {}
+
+
+class Limited(gym.Wrapper):
+    def __init__(self, length, render_mode=None):
+        super().__init__(gym.wrappers.TimeLimit(Walk(length), 2))
+        self.given = render_mode
 
 
 class NoEnv:
@@ -156,6 +163,82 @@ def test_an_env_class_of_an_allowed_module_needs_no_registration(own: Path) -> N
     assert [env.step(0)[3] for _ in range(2)] == [False, True]
     with pytest.raises(EnvError, match=r"own_walks:Walk takes no argument 'lenght'.*'length'"):
         make_env("own_walks:Walk", {"lenght": 2})
+
+
+def test_a_wrapper_of_an_allowed_module_is_an_env_class_too(own: Path) -> None:
+    allow_modules(["own_walks"])
+    info = check_env("own_walks:Limited", {"length": 7}, "ppo")
+    assert (info.env_id, info.max_episode_steps, info.has_vector_entry_point) == ("own_walks:Limited", 2, False)
+    env = make_vector_env("own_walks:Limited", {"length": 7}, 2)
+    env.reset(seed=0)
+    assert [env.step(np.zeros(2, np.int64))[3].tolist() for _ in range(2)] == [[False] * 2, [True] * 2]
+    drawn: Any = make_env("own_walks:Limited", {"length": 7}, render_mode="rgb_array")
+    while type(drawn).__name__ != "Limited":
+        drawn = drawn.env
+    assert drawn.given == "rgb_array"
+    with pytest.raises(EnvError, match=r"own_walks:Limited takes no argument 'lenght'.*'length'"):
+        make_env("own_walks:Limited", {"lenght": 2})
+
+
+NAMESAKES = """
+import gymnasium as gym
+import own_walks
+from own_walks import Walk
+
+
+class CartPole(own_walks.Walk):
+    pass
+
+
+class OwnWalk(own_walks.Walk):
+    pass
+
+
+gym.register("OwnWalk-v5", lambda: OwnWalk(5))
+gym.register("Walk-v3", "own_walks:Walk", max_episode_steps=7)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "meant", "env_id"),
+    [
+        ("CartPole", "CartPole", "own_names:CartPole"),
+        ("CartPole-v1", "CartPoleEnv", "own_names:CartPole-v1"),
+        ("Acrobot", "AcrobotEnv", "own_names:Acrobot-v1"),
+        # What is registered has a time limit that the class alone has not.
+        ("OwnWalk", "OwnWalk", "own_names:OwnWalk-v5"),
+        ("Walk", "Walk", "own_names:Walk-v3"),
+    ],
+)
+def test_a_class_of_ones_own_may_have_the_name_of_anothers_environment(
+    own: Path, monkeypatch: pytest.MonkeyPatch, name: str, meant: str, env_id: str
+) -> None:
+    (own / "own_names.py").write_text(NAMESAKES)
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
+    allow_modules(["own_names", "own_walks"])
+    assert type(make_env(f"own_names:{name}").unwrapped).__name__ == meant
+    assert normalize_env_id(f"own_names:{name}") == env_id
+
+
+@pytest.mark.parametrize(
+    ("env_id", "written"),
+    [
+        ("own_walks/Nowhere-v0", "own_walks:own_walks/Nowhere-v0"),
+        ("own-walks/Nowhere-v0", "own_walks:own-walks/Nowhere-v0"),
+        ("own_nowhere/Walk-v0", None),
+        ("own_walks", None),
+    ],
+)
+def test_a_namespace_that_is_a_module_may_be_what_registers_it(
+    own: Path, monkeypatch: pytest.MonkeyPatch, env_id: str, written: str | None
+) -> None:
+    monkeypatch.syspath_prepend(own)
+    with pytest.raises(EnvError, match="is registered with Gymnasium") as failure:
+        make_env(env_id)
+    assert ("registers it, that is written" in failure.value.hint) is (written is not None)
+    assert (written or "") in failure.value.hint
+    assert "own_walks" not in sys.modules
 
 
 @pytest.mark.parametrize(("name", "guess"), [("Wlak", "Walk"), ("NoEnv", ""), ("OwnWalk-v7", "OwnWalk-v"), ("", "")])

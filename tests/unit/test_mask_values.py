@@ -35,3 +35,25 @@ def test_what_is_a_mask(mask: Any) -> None:
     found = checked_mask(mask, (2, 1))
     assert found.dtype == np.float32
     assert found.tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("mask", "sizes", "are_actions"),
+    [
+        ([5, 2, 7], (9,), True),
+        (np.array([1, 0]), (9,), True),
+        ([2, 0, 1], (3,), True),
+        ([3, 0, 1], (3,), False),
+        ([2, 2, 1], (9,), False),
+        ([-1, 2], (9,), False),
+        ([0.0, 2.0], (9,), False),
+        ([2, 0, 1], (9, 2, 1), False),
+    ],
+    ids=str,
+)
+def test_the_actions_that_are_allowed_are_no_mask_but_may_be_made_one(
+    mask: Any, sizes: tuple[int, ...], *, are_actions: bool
+) -> None:
+    with pytest.raises(MaskProblemError) as problem:
+        checked_mask(mask, sizes)
+    assert ("make zeros and ones of them" in str(problem.value)) is are_actions

@@ -1,17 +1,21 @@
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 from policies.acting.policy import RandomPolicy
 from policies.acting.video import record_video
 from policies.envs import rendering
+from policies.envs.faults import close_env
+from policies.envs.make import check_env, make_env, make_vector_env
 from policies.envs.rendering import choose_before_import, display_hint, draw_without_display
 from policies.errors import EnvError
 
@@ -225,6 +229,103 @@ def test_who_wants_a_display_is_told_what_gives_one(
     assert failure.value.hint
 
 
+WITH_A_WINDOW = """
+import gymnasium as gym
+from gymnasium.envs.classic_control import CartPoleEnv
+
+made = []
+
+
+class Window(CartPoleEnv):
+    def __init__(self, render_mode{default}, is_right=True):
+        made.append(render_mode)
+        if {refuses}:
+            raise ValueError("not without a window")
+        if not is_right:
+            raise ValueError("it is not right")
+        super().__init__(render_mode)
+
+
+gym.register("SelfShown-v0", Window, max_episode_steps=5{given})
+"""
+
+
+@pytest.fixture
+def with_a_window(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., types.ModuleType]:
+    """Import a module of an env whose window opens by itself."""
+    monkeypatch.syspath_prepend(tmp_path)
+    # So that what a test registers is taken away.
+    monkeypatch.setattr(gym.envs.registration, "registry", dict(gym.registry))
+    monkeypatch.setattr(gym, "registry", gym.envs.registration.registry)
+
+    def make(default: str, refuses: str = "False", given: str = "") -> types.ModuleType:
+        name = f"window_{tmp_path.name}"
+        (tmp_path / f"{name}.py").write_text(WITH_A_WINDOW.format(default=default, refuses=refuses, given=given))
+        monkeypatch.setattr("policies.envs.modules._allowed", {name})
+        return importlib.import_module(name)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("default", "given"),
+    [('="human"', ""), ("=None", ', kwargs={"render_mode": "human"}'), ("", ', kwargs={"render_mode": "human"}')],
+)
+def test_no_window_is_opened_where_nothing_is_to_be_seen(
+    with_a_window: Callable[..., types.ModuleType], default: str, given: str
+) -> None:
+    module = with_a_window(default, given=given)
+    for env_id in [f"{module.__name__}:SelfShown-v0"] + [f"{module.__name__}:Window"] * (default == '="human"'):
+        check_env(env_id, None)
+        make_vector_env(env_id, None, 2).close()
+        assert set(module.made) == {None}
+        close_env(make_env(env_id, render_mode="rgb_array"))
+        close_env(make_env(env_id, render_mode="human"))
+        assert [module.made.pop(), module.made.pop()] == ["human", "rgb_array"]
+
+
+def test_an_env_that_takes_no_other_mode_than_a_window_gets_it(
+    with_a_window: Callable[..., types.ModuleType],
+) -> None:
+    module = with_a_window('="human"', refuses='render_mode != "human"')
+    close_env(make_env(f"{module.__name__}:Window"))
+    assert module.made == [None, "human"]
+
+
+@pytest.mark.parametrize("default", ['="rgb_array"', "=None"])
+def test_other_modes_by_default_stay(with_a_window: Callable[..., types.ModuleType], default: str) -> None:
+    module = with_a_window(default)
+    close_env(make_env(f"{module.__name__}:Window"))
+    assert module.made == ["rgb_array" if "rgb" in default else None]
+
+
+def test_what_else_a_constructor_says_is_said(with_a_window: Callable[..., types.ModuleType]) -> None:
+    module = with_a_window('="human"')
+    with pytest.raises(EnvError, match="it is not right"):
+        make_env(f"{module.__name__}:Window", {"is_right": False})
+
+
+@pytest.mark.parametrize("where", ["constructor", "reset", "step"])
+@pytest.mark.parametrize(
+    "error", ["ModuleNotFoundError('No module named pyvirtualdisplay')", "ImportError('no libGL')"]
+)
+def test_what_is_not_installed_is_to_be_installed_wherever_it_is_missed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, where: str, error: str
+) -> None:
+    lines = ["from gymnasium.envs.classic_control import CartPoleEnv", "class Lacking(CartPoleEnv):"]
+    lines += [
+        f"    def {'__init__' if where == 'constructor' else where}(self, *args, **kwargs):",
+        f"        raise {error}",
+    ]
+    name = f"lacking_{tmp_path.name}"
+    (tmp_path / f"{name}.py").write_text("\n".join(lines) + "\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("policies.envs.modules._allowed", {name})
+    with pytest.raises(EnvError) as failure:
+        check_env(f"{name}:Lacking", None)
+    assert failure.value.hint == "Install the package that the message names, on every machine that runs trials."
+
+
 class NoSuchDisplayException(Exception):  # noqa: N818 (as pyglet calls it)
     pass
 
@@ -241,6 +342,9 @@ class MuteError(Exception):
         (OSError("X11: The DISPLAY environment variable is missing"), True),
         (KeyError("display_mode"), False),
         (ValueError("nothing is displayed"), False),
+        (ImportError("this needs an X11 display"), True),
+        # With a display it would be missing, too.
+        (ModuleNotFoundError("No module named 'pyvirtualdisplay'"), False),
         (MuteError(), False),
     ],
 )
