@@ -135,7 +135,7 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
     cap = source.sweep.section("stop").get("num_env_steps")
     cap = length_of(best.point, cap) if isinstance(cap, int) else 100_000
-    names = ("frame_stack", "pixels", "atari", "action_mask", "failure_penalty")
+    names = ("frame_stack", "pixels", "atari", "action_mask", "own_process", "failure_penalty")
     changed = [name for name in names if env.get(name) not in (None, 1, False)]
     note = f" The env's {', '.join(changed)} are left out." if changed else ""
     flattens = source.sweep.is_flattened

@@ -27,6 +27,7 @@ from policies.envs.flat import FlatBox
 from policies.envs.make import make_env
 from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices, Numbers
+from policies.envs.own_process import OWN_PROCESS
 from policies.envs.together import stepper_of
 from policies.errors import EnvError, SpecError
 
@@ -37,6 +38,8 @@ MAX_EPISODE_STEPS = 10_000
 """The cap for an env without a time limit."""
 MAX_ENVS = 16
 """The most environments that are open at once, so that networks get batches."""
+_MAX_PROCESSES = 4
+"""The same of envs that are in processes of their own: starting one takes longer than batches gain."""
 _KINDS = (MaskedBox, FlatBox, Numbers, gym.spaces.Box, gym.spaces.Discrete)
 """The spaces of which an env may have classes of its own, behind those made here, which are Boxes too."""
 
@@ -110,9 +113,9 @@ class Evaluator:
         max_episode_steps: int | None = None,
         max_envs: int = MAX_ENVS,
     ) -> None:
-        self._max_envs = max_envs
         self.seeds = check_seeds(seeds)
         self.env_id, self.env_args = env_id, dict(env_args or {})
+        self._max_envs = min(max_envs, _MAX_PROCESSES) if self.env_args.get(OWN_PROCESS) else max_envs
         self._envs = [make_env(env_id, self.env_args)]
         self.max_episode_steps = episode_cap(self._envs[0], max_episode_steps)
         self._cartpoles = CartPolePlayer.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)

@@ -6,13 +6,14 @@ Raised by an env, they are treated as any other error of the env; raised for a s
 
 from __future__ import annotations
 
+import re
 import signal
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import PurePath
 from traceback import walk_tb
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from gymnasium.error import DependencyNotInstalled
 
@@ -20,6 +21,9 @@ from policies.envs.rendering import display_hint
 from policies.errors import EnvFailedError, said_by
 
 _PACKAGE = PurePath(__file__).parents[1]
+_ONE_ALONE = re.compile("(?i)(per|same|each|one|single) process")
+"""In an error of an env that can't be in a process twice, such as stable-retro's."""
+_PLACE = "_place_in_its_process"
 _notes_signals = False
 _signalled = False
 
@@ -81,9 +85,11 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
 
 
 def known_hint(error: BaseException) -> str | None:
-    """Return what to do about an error of an env's code that lacks a package or a display; None: another one."""
+    """Return what to do about an error of an env that lacks a package, a display or room; None: another one."""
     if (hint := display_hint(error)) is not None:
         return hint
+    if _ONE_ALONE.search(said_by(error)):
+        return "If a process can hold one such environment only, give each a process of its own: env.own_process: true."
     if isinstance(error, ImportError | DependencyNotInstalled):
         return "Install the package that the message names, on every machine that runs trials."
     return None
@@ -91,11 +97,18 @@ def known_hint(error: BaseException) -> str | None:
 
 def place_in_env(error: BaseException) -> Frame | None:
     """Return where in an env's own code an exception comes from; None: from none of it."""
+    if (there := vars(error).get(_PLACE)) is not None:
+        return cast("Frame", there)
     frames = [
         Frame(frame.f_code.co_filename, line, frame.f_code.co_name) for frame, line in walk_tb(error.__traceback__)
     ]
     # The outermost frame is the caller's.
     return frame_of_env(frames[:0:-1])
+
+
+def set_place(error: BaseException, place: Frame | None) -> None:
+    """Say where an exception comes from that an env raised in another process."""
+    vars(error)[_PLACE] = place
 
 
 class Frame(NamedTuple):

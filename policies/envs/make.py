@@ -18,7 +18,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from policies.envs import atari, calls
@@ -29,9 +28,11 @@ from policies.envs.faults import close_env, is_of_env, known_hint, place_in_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
+from policies.envs.mask_hints import looks_like_mask
 from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_by_networks
 from policies.envs.mujoco_warnings import say_each_once
-from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of, sizes_of
+from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of
+from policies.envs.own_process import InOwnProcess
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import choose_before_import, draw_without_display, without_window
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
@@ -146,14 +147,9 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         infos = check_first_step(env, info.env_id, constructor_args(info.env_args))
     finally:
         close_env(env)
-    if mask is None and wrappers.action_mask is None and _looks_like_mask(infos.get(ACTION_MASK), info.action_space):
+    if mask is None and wrappers.action_mask is None and looks_like_mask(infos.get(ACTION_MASK), info.action_space):
         return replace(info, unused_mask=ACTION_MASK)
     return info
-
-
-def _looks_like_mask(value: Any, action_space: gym.Space[Any]) -> bool:
-    sizes = sizes_of(action_space)
-    return bool(sizes) and isinstance(value, np.ndarray) and value.size == sum(sizes)
 
 
 def make_env(
@@ -181,7 +177,7 @@ def make_env(
     try:
         with calls.inside(Call.CONSTRUCTOR):
             # The passive checker only prints warnings, at each env made, and slows every step.
-            env = _made(partial(gym.make, spec, disable_env_checker=True), env_id, spec, kwargs, wrappers)
+            env = _made(partial(gym.make, disable_env_checker=True), env_id, spec, kwargs, wrappers)
         return calls.watch_env(wrappers.wrap(env, {**spec.kwargs, **kwargs}))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
@@ -224,7 +220,7 @@ def make_vector_env(
                 given = {**spec.kwargs, **kwargs}
                 around = lambda game: wrappers.wrap_images(game, given), wrappers.wrap_mask, flattened, PlainSteps
                 make_all = partial(gym.make_vec, vectorization_mode="sync", disable_env_checker=True, wrappers=around)
-                env = _made(partial(make_all, spec, num_envs=num_envs), env_id, spec, kwargs, wrappers)
+                env = _made(partial(make_all, num_envs=num_envs), env_id, spec, kwargs, wrappers)
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
@@ -258,11 +254,14 @@ def _made(
     creator = _creator(env_id, spec)
     if wrappers.atari is not None:
         kwargs = wrappers.atari.game_args(env_id, creator, kwargs)
-    return without_window(make, kwargs, creator, spec.kwargs)
+    made = replace(spec, entry_point=partial(InOwnProcess, env_id)) if wrappers.own_process else spec
+    return without_window(partial(make, made), kwargs, creator, spec.kwargs)
 
 
 def _may_be_vectorised(env_id: str, spec: EnvSpec, wrappers: ObservationWrappers) -> bool:
     """Whether a vectorised version, around which there are no wrappers, may observe what they make."""
+    if wrappers.own_process:
+        return False
     return not (wrappers.observes_images or may_be_masked(_creator(env_id, spec), wrappers.action_mask))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from policies.envs.mask_values import checked_mask
 from policies.envs.masks import ACTION_MASK, METHOD, MaskedBox, Setting, member_problem, needs_nothing
@@ -44,6 +45,12 @@ def argument_hint(space: MaskedBox, setting: Setting) -> str:
     called = f'mask=env.get_wrapper_attr("{method}")()'
     # Without a setting, a mask that is no member is a method.
     return f", and {called}" if setting is None else f', and mask=info["{name}"], or {called} if it is a method'
+
+
+def looks_like_mask(value: Any, action_space: gym.Space[Any]) -> bool:
+    """Whether something has a number for each action of a space."""
+    sizes = sizes_of(action_space)
+    return bool(sizes) and isinstance(value, np.ndarray) and value.size == sum(sizes)
 
 
 def _infos(env: gym.Env[Any, Any], infos: Any) -> Iterator[str]:

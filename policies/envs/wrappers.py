@@ -2,7 +2,8 @@
 
 Frames and pixels belong to the environment: the observations are the same in training, evaluation and videos.
 So they travel in the env arguments, under the reserved keys `frame_stack` and `pixels`, and so do `atari`
-(`policies.envs.atari`) and the name of the mask of actions, `action_mask`. The failure penalty belongs to training
+(`policies.envs.atari`), the name of the mask of actions, `action_mask`, and `own_process`
+(`policies.envs.own_process`). The failure penalty belongs to training
 alone, and is never among the env arguments.
 
 Words: a *frame* is one observation; an *image* is of shape (rows, columns, channels).
@@ -25,10 +26,13 @@ from policies.envs.failures import FailureRule
 from policies.envs.flat import flattened
 from policies.envs.masks import ACTION_MASK, MaskedBox, Setting, check_setting, masked, num_masked
 from policies.envs.own_actions import with_own_actions
+from policies.envs.own_process import OWN_PROCESS
 from policies.envs.training_view import TrainingView
 from policies.errors import EnvError
 
 FRAME_STACK, PIXELS = "frame_stack", "pixels"
+RESERVED = (FRAME_STACK, PIXELS, ATARI, ACTION_MASK, OWN_PROCESS)
+"""The reserved keys."""
 MAX_PIXELS = 64
 """The most rows and columns that `shrink_to_grey` makes."""
 
@@ -45,6 +49,8 @@ class ObservationWrappers:
     pixels: bool = False
     action_mask: Setting = None
     atari: AtariFrames | None = None
+    own_process: bool = False
+    """Whether the environment is in a process of its own, without these wrappers."""
 
     @property
     def observes_images(self) -> bool:
@@ -64,6 +70,9 @@ class ObservationWrappers:
             raise EnvError(f"{FRAME_STACK} is {frames!r}; it must be a whole number >= 1.", "1 stacks nothing.")
         if not isinstance(pixels, bool):
             raise EnvError(f"{PIXELS} is {pixels!r}; it must be true or false.", "Set it to true, or leave it out.")
+        own_process = env_args.pop(OWN_PROCESS, False)
+        if not isinstance(own_process, bool):
+            raise EnvError(f"{OWN_PROCESS} is {own_process!r}; it must be true or false.", "Leave it out for false.")
         atari = AtariFrames.take_from(env_args)
         if mask and (pixels or atari is not None):
             which = f"{PIXELS} true" if pixels else f"{ATARI} is set"
@@ -71,7 +80,7 @@ class ObservationWrappers:
                 f"{ACTION_MASK} is {mask!r} and {which}: masks go with vectors, not with images.",
                 f"Leave {PIXELS if pixels else ATARI} out, or set {ACTION_MASK}: false.",
             )
-        return cls(frames, pixels, mask, atari)
+        return cls(frames, pixels, mask, atari, own_process)
 
     def wrap(self, env: gym.Env[Any, Any], env_args: Mapping[str, Any]) -> gym.Env[Any, Any]:
         """Return an environment with these wrappers; for pixels, it must have been made with a render mode.
@@ -123,6 +132,7 @@ def with_wrappers(
     pixels: bool,
     action_mask: Setting = None,
     atari: Mapping[str, int] | None = None,
+    own_process: bool = False,
 ) -> dict[str, Any]:
     """Return env arguments with the reserved keys of those wrappers that change something."""
     wrapped = dict(env_args)
@@ -134,12 +144,14 @@ def with_wrappers(
         wrapped[ACTION_MASK] = action_mask
     if atari is not None:
         wrapped[ATARI] = dict(atari)
+    if own_process:
+        wrapped[OWN_PROCESS] = True
     return wrapped
 
 
 def constructor_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
     """Return env arguments without the reserved keys."""
-    return {name: value for name, value in env_args.items() if name not in (FRAME_STACK, PIXELS, ACTION_MASK, ATARI)}
+    return {name: value for name, value in env_args.items() if name not in RESERVED}
 
 
 def shrink_to_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

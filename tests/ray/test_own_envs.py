@@ -181,6 +181,20 @@ def test_an_env_id_of_an_allowed_module_trains_in_env_runners_too_and_goes_on_wi
     assert sweeps.extend("own", 1, storage=tmp_path, finish=False).trials[1].status == "completed"
 
 
+@pytest.mark.parametrize(("engine_name", "algorithm"), [("packed", "ppo"), ("rllib", "dqn")])
+def test_what_a_process_can_hold_once_trains(tmp_path: Path, engine_name: str, algorithm: str) -> None:
+    env_modules.allow_modules([OWN])
+    fast = {"hidden_sizes": [8], "num_envs": 2, "lr": 0.01, "train_batch_size": 128}
+    fast |= {"minibatch_size": 64} if algorithm == "ppo" else {}
+    spec = {"engine": engine_name, "algorithm": algorithm, "hyperparams": fast, "num_samples": 2}
+    is_packed = engine_name == "packed"
+    result = launch(tmp_path, spec | {"env": {"id": f"{OWN}:OneEdge", "own_process": True}}, finish=is_packed)
+    assert [trial.status for trial in result.trials] == ["completed"] * 2, result.trials[0].error
+    if is_packed:
+        assert present(result.best).confirmation.env_args == {"own_process": True}
+        assert {"policy", "after_mp4", "report"} <= set(result.artifacts), result.notes
+
+
 def test_the_command_line_finds_modules_in_the_folder_it_is_run_in(tmp_path: Path) -> None:
     """With a Ray of its own, whose workers get neither this process's path nor its modules."""
     source = Path(present(sys.modules[OWN].__file__) if OWN in sys.modules else ROOT / f"tests/ray/env_plugin/{OWN}.py")

@@ -10,13 +10,12 @@ import gymnasium as gym
 import numpy as np
 
 from policies.acting.baselines import BASELINES
-from policies.envs.atari import ATARI
 from policies.envs.failures import check_failure_penalty
 from policies.envs.make import EnvInfo
 from policies.envs.masks import ACTION_MASK, seen_by_networks
 from policies.envs.own_actions import Choices
 from policies.envs.space_hints import channels_last_hint
-from policies.envs.wrappers import FRAME_STACK, PIXELS
+from policies.envs.wrappers import PIXELS, RESERVED
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
 from policies.portable.convolution import output_shape
@@ -37,7 +36,7 @@ def check_env_args(spec: SweepSpec) -> None:
     Raises:
         SpecError: There is one.
     """
-    for name in (FRAME_STACK, PIXELS, ATARI, ACTION_MASK, "failure_penalty"):
+    for name in (*RESERVED, "failure_penalty"):
         if name in spec.env.args:
             raise SpecError(
                 f"env.args.{name} is {spec.env.args[name]!r}, but {name} is not an argument of an env's constructor.",

@@ -74,6 +74,10 @@ class EnvSpec(Section):
         description="true, or a mapping: the standard preprocessing of an Atari game. Evaluations and reported returns "
         "are of whole games, with the game's own rewards. null: none.",
     )
+    own_process: Flag = Field(
+        default=False,
+        description="Whether each of its environments is in a process of its own, because a process can hold one only.",
+    )
     failure_penalty: Annotated[Number, Field(ge=-_LARGEST_REWARD, le=_LARGEST_REWARD)] | None = Field(
         None,
         description="Reward of the step in which the env ends by failure, such as the pole's fall. Training sees it, "
@@ -92,14 +96,17 @@ class EnvSpec(Section):
             pixels=self.pixels,
             action_mask=self.action_mask,
             atari=None if self.atari is None else self.atari.frames,
+            own_process=self.own_process,
         )
 
     @model_serializer(mode="wrap")
     def _only_if_set(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Versions that don't know the field read sweeps that don't use it.
+        # Versions that don't know the fields read sweeps that don't use them.
         content: dict[str, Any] = handler(self)
         if self.atari is None:
             content.pop("atari", None)
+        if not self.own_process:
+            content.pop("own_process", None)
         return content
 
 

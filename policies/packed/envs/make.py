@@ -164,7 +164,8 @@ def check_seedable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
         )
     raise EnvError(
         f"{env_id} depends on other environments in the same process, so its trials cannot be packed: after "
-        f"reset(seed=0) and with the same actions, but with another copy beside it, {difference}.",
+        f"reset(seed=0) and with the same actions, but with another copy beside it, {difference}; with "
+        "env.own_process: true each would be alone.",
         "Let each copy keep its own state and draw from self.np_random, not from generators that all share; or set "
         "engine: rllib.",
     )

@@ -60,6 +60,21 @@ class SlowEdge(Edge):
         return super().step(action)
 
 
+class OneEdge(Edge):
+    """The same, of which a process can hold one only."""
+
+    made = 0
+
+    def __init__(self, **kwargs: Any) -> None:
+        if OneEdge.made:
+            raise RuntimeError("Cannot create multiple edges per process")
+        OneEdge.made = 1
+        super().__init__(**kwargs)
+
+    def close(self) -> None:
+        OneEdge.made = 0
+
+
 if "TestEdge-v0" not in gym.registry:
     # Gymnasium's type asks for a class that takes any keywords.
     gym.register("TestEdge-v0", Edge, reward_threshold=11.5)  # type: ignore[arg-type]
