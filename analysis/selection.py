@@ -232,9 +232,12 @@ def _why_none(trials: Sequence[TrialRecord]) -> tuple[str, str]:
     message = f"No trial of {len(trials)} is usable: {parts}."
     if failed:
         first = min(failed, key=lambda trial: trial.index)
+        hint = error_hint(first.error)
         return (
             f"{message} First error ({first.trial_id}): {error_summary(first.error)}",
-            f"Read the log of {first.trial_id}, mend the cause and launch again.",
+            f"Read the log of {first.trial_id}, mend the cause and launch again."
+            if hint is None
+            else f"{hint} The log of {first.trial_id} says more.",
         )
     if any(trial.status not in FINISHED for trial in trials):
         return message, "Wait for the first evaluation, or resume the sweep if it was interrupted."
@@ -252,3 +255,14 @@ def error_summary(error: str | None) -> str:
         line = next((item for item in lines[1:] if not item[0].isspace()), line)
     line = line.strip()
     return line if len(line) <= _MAX_ERROR_CHARS else line[: _MAX_ERROR_CHARS - 1] + "…"
+
+
+def error_hint(error: str | None) -> str | None:
+    """Return the line of a recorded error that says what to do; None: there is none.
+
+    An error that has one is its message and that line, and at the end of the log behind them both stand again.
+    """
+    message, _, rest = (error or "").partition("\n")
+    hint, _, log = rest.partition("\n")
+    is_repeated = bool(message.strip() and hint.strip()) and f"{message}\n{hint}" in log
+    return hint if is_repeated and not hint[0].isspace() else None

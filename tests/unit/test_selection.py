@@ -10,6 +10,7 @@ from analysis.records import CheckpointRecord, TrialRecord
 from analysis.selection import (
     NoUsableTrialError,
     best_checkpoint,
+    error_hint,
     error_summary,
     policy_candidates,
     rank_points,
@@ -239,6 +240,34 @@ def test_the_error_is_a_not_found_error_that_pickles() -> None:
 )
 def test_error_summary_is_the_line_that_names_the_error(error: str | None, line: str) -> None:
     assert error_summary(error) == line
+
+
+@pytest.mark.parametrize(
+    ("error", "hint"),
+    [
+        ("It broke.\nMend it.\n  File here\npolicies.errors.EnvError: It broke.\nMend it.", "Mend it."),
+        ("It broke.\nMend it.\n  File here\npolicies.errors.EnvError: It broke.\nMend it.\nMore.", "Mend it."),
+        # The second line is of the log already.
+        ("KeyError: 'x'\n  File here\n  line\nKeyError: 'x'", None),
+        ("KeyError: 'x'\nsaid by the env\nKeyError: 'x'", None),
+        ("It broke.\n  File here\nEnvError: It broke.\n  File here\nEnvError: It broke.", None),
+        ("It broke.\nMend it.", None),
+        ("\n\n\n", None),
+        ("It broke.", None),
+        ("", None),
+        (None, None),
+    ],
+)
+def test_error_hint_is_the_line_that_the_log_says_again(error: str | None, hint: str | None) -> None:
+    assert error_hint(error) == hint
+    record = trial(0, status="failed", error=error)
+    with pytest.raises(NotFoundError) as failure:
+        select_best([record])
+    assert failure.value.hint == (
+        "Read the log of t0000, mend the cause and launch again."
+        if hint is None
+        else f"{hint} The log of t0000 says more."
+    )
 
 
 def test_error_summary_is_short() -> None:
