@@ -153,10 +153,21 @@ def _reward_problem(reward: Any) -> str | None:
     except Exception:  # noqa: BLE001 (whatever it is, it is no number)
         is_number = False
     if not is_number:
-        return f"{_kind(reward)} as reward, not a number"
+        return f"{_kind(reward)} as reward, not a number{_if_several(reward)}"
     if is_sound(np.asarray(number)):
         return None
     return f"the reward {number!r}{_if_finite(number)}"
+
+
+def _if_several(reward: Any) -> str:
+    """Return what makes a number of the rewards of several agents or objectives; "": it is none such."""
+    if not isinstance(reward, np.ndarray | list | tuple):
+        return ""
+    with contextlib.suppress(ValueError):  # members of several lengths
+        array = np.asarray(reward)
+        if array.ndim == 1 and array.size > 1 and array.dtype.kind in "biuf":
+            return ": gymnasium.wrappers.TransformReward(env, sum), in a module of your own, would make it one"
+    return ""
 
 
 def _is_bool(value: Any) -> bool:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -11,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv, CartPoleVectorEnv
+from hostile_envs import Malformed
 from policy_factory import register_test_envs
 
 from policies.acting.baselines import ConstantPolicy
@@ -304,7 +306,13 @@ def test_a_malformed_reset_is_refused_with_what_it_returns(fault: str, words: st
         ("nan reward", "the reward nan"),
         ("huge reward", r"the reward 1e\+300, which is infinite in 32 bits"),
         ("huge observation", r"are not finite: 1e\+39 at \[1\], which is infinite in 32 bits"),
-        ("two rewards", "as reward, not a number"),
+        ("two rewards", r"as reward, not a number: .*TransformReward\(env, sum\)"),
+        ("rewards of agents", r"a list of 2 as reward, not a number: .*TransformReward\(env, sum\)"),
+        ("rewards by name", r"as reward, not a number\.\n"),
+        ("square of rewards", r"as reward, not a number\.\n"),
+        ("empty reward", r"as reward, not a number\.\n"),
+        ("uneven rewards", r"as reward, not a number\.\n"),
+        ("texts as rewards", r"as reward, not a number\.\n"),
         ("number terminated", r"0 \(int\) as terminated, not a bool"),
         ("unshowable truncated", r"a value \(Unshowable\) as truncated, not a bool"),
         ("long text as reward", r"'x+\.\.\. as reward, not a number"),
@@ -323,6 +331,15 @@ def test_a_malformed_first_step_is_refused_with_what_it_returns(fault: str, word
         check_env("hostile_envs:Malformed", args, "ppo")
     assert len(caught.value.message) < 300
     assert "(observation, reward, terminated, truncated, info)" in caught.value.hint
+
+
+def test_what_is_named_for_several_rewards_makes_one_of_them() -> None:
+    with pytest.raises(EnvError) as caught:
+        check_env("hostile_envs:Malformed", {"step": "rewards of agents"}, "ppo")
+    expression = present(re.search(r"gymnasium\S+\(env, sum\)", caught.value.message)).group()
+    env: Any = eval(expression, {"gymnasium": gym, "env": Malformed(step="rewards of agents")})
+    env.reset()
+    assert env.step(0)[1] == 1.5
 
 
 @pytest.mark.parametrize("kind", ["float64", "list", "reward in an array", "reward in a list", "infos"])
