@@ -136,11 +136,17 @@ class InOwnProcess(gym.Env[Any, Any]):
         return self._ask(method, args, kwargs)
 
     def _ask(self, *asked: Any) -> Any:
+        data = pickle.dumps(asked)
         try:
-            self._connection.send(asked)
-            answer = self._connection.recv()
+            self._connection.send_bytes(data)
+            data = self._connection.recv_bytes()
         except (EOFError, OSError) as error:
             raise RuntimeError(f"its own process {self._how_it_ended()}") from error
+        except BaseException:
+            # The answer that was not waited for would be taken for that of the next question.
+            self._end()
+            raise
+        answer = pickle.loads(data)  # noqa: S301 (of our own process)
         if isinstance(answer, _Raised):
             _raise(answer)
         return answer

@@ -209,6 +209,35 @@ def test_one_that_hangs_is_killed_when_it_is_closed(monkeypatch: pytest.MonkeyPa
     assert not is_alive(pid)
 
 
+def test_whoever_is_interrupted_as_it_waits_gets_no_answer_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_process, "_PATIENCE_S", 0.2)
+    env = make_env("lone_envs:Failing", {**ALONE, "where": "step", "how": "hangs", "action_mask": False})
+    pid = env.reset(seed=0)[1]["pid"]
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, 0.3)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            env.step(0)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert not is_alive(pid)
+    with pytest.raises(RuntimeError, match="its own process was killed by SIGKILL"):
+        env.reset(seed=0)
+
+
+def test_what_cannot_be_sent_there_is_not_sent() -> None:
+    env = make_env("lone_envs:Lone", ALONE)
+    env.reset(seed=0)
+    with pytest.raises(Exception, match="pickle"):
+        env.reset(seed=0, options={"f": lambda: None})
+    assert env.step(2)[1] == 1
+    close_env(env)
+
+
 def test_what_nothing_holds_any_more_ends() -> None:
     env = make_env("lone_envs:Lone", ALONE)
     pid = env.reset(seed=0)[1]["pid"]
