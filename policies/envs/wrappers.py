@@ -80,6 +80,11 @@ class ObservationWrappers:
                 f"{ACTION_MASK} is {mask!r} and {which}: masks go with vectors, not with images.",
                 f"Leave {PIXELS if pixels else ATARI} out, or set {ACTION_MASK}: false.",
             )
+        if own_process and atari is not None:
+            raise EnvError(
+                f"{OWN_PROCESS} is true and {ATARI} is set: its games read their emulator's memory.",
+                f"Leave {OWN_PROCESS} out: a process can hold many of these games.",
+            )
         return cls(frames, pixels, mask, atari, own_process)
 
     def wrap(self, env: gym.Env[Any, Any], env_args: Mapping[str, Any]) -> gym.Env[Any, Any]:

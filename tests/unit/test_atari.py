@@ -181,6 +181,7 @@ def test_true_is_the_standard_and_a_mapping_changes_it() -> None:
     ("env", "words"),
     [
         ({"atari": True, "pixels": True}, r"env\.pixels: true cannot be used with env\.atari"),
+        ({"atari": True, "own_process": True}, r"env\.own_process: true cannot be used with env\.atari"),
         ({"atari": True, "failure_penalty": -1}, r"env\.failure_penalty: -1 cannot be used with env\.atari"),
         ({"atari": {"frame_skips": 4}}, r"env\.atari.*frame_skips"),
         ({"atari": {"frame_skip": 0}}, r"env\.atari.*frame_skip"),

@@ -121,10 +121,14 @@ def test_its_arguments_are_checked_and_its_mask_and_failure_are_found() -> None:
         make_env("lone_envs:Lone", {**ALONE, "lenght": 5})
     with pytest.raises(EnvError, match="own_process is 'yes'; it must be true or false"):
         make_env("lone_envs:Lone", {"own_process": "yes"})
+    with pytest.raises(EnvError, match="own_process is true and atari is set"):
+        make_env("lone_envs:Lone", {**ALONE, "atari": {}})
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "lone_envs:Pole", "Pendulum-v1"])
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "lone_envs:Pole", "Pendulum-v1", "Hopper-v5"])
 def test_episodes_are_what_they_are_here_to_the_last_bit(env_id: str) -> None:
+    if env_id.startswith("Hopper"):
+        pytest.importorskip("mujoco")
     policy = RandomPolicy.for_env(env_id)
     args = {"max_episode_steps": 30}
     here, there = (

@@ -291,6 +291,9 @@ def env_problems(spec: SweepFields) -> Found:
             f"{spec.env.failure_penalty:g} cannot be used with env.atari, whose lost lives are ends without a penalty"
         )
         found.append(("env.failure_penalty", f"{text}: leave it out"))
+    if spec.env.own_process:
+        text = "true cannot be used with env.atari, whose games read their emulator's memory: leave it out"
+        found.append(("env.own_process", text))
     return found
 
 
