@@ -80,7 +80,7 @@ class InOwnProcess(gym.Env[Any, Any]):
         RuntimeError: Its process has ended, or what it raised can't be sent.
     """
 
-    def __init__(self, env_id: str, **env_args: Any) -> None:
+    def __init__(self, env_id: str, /, **env_args: Any) -> None:  # an env may have an argument env_id
         self._connection, theirs = Pipe()
         code = _BOOTSTRAP.format(
             root=str(Path(__file__).parents[2]),

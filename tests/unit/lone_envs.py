@@ -70,7 +70,13 @@ class Behind(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class Pole(CartPoleEnv):
-    """CartPole by another name."""
+    """CartPole by another name; its arguments have the names of ours."""
+
+    def __init__(
+        self, *, env_id: str = "", name: str = "", make: str = "", creator: str = "", render_mode: str | None = None
+    ) -> None:
+        super().__init__(render_mode=render_mode)
+        self.given = [env_id, name, make, creator]
 
 
 class SelfMadeError(Exception):

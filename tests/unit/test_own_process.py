@@ -137,6 +137,16 @@ def test_episodes_are_what_they_are_here_to_the_last_bit(env_id: str) -> None:
     assert here == there
 
 
+@pytest.mark.parametrize("alone", [{}, ALONE], ids=str)
+def test_arguments_may_be_called_as_ours_are(alone: dict[str, Any]) -> None:
+    given = {"env_id": "a", "name": "b", "make": "c", "creator": "d"}
+    env: Any = make_env("lone_envs:Pole", given | alone)
+    vector: Any = make_vector_env("lone_envs:Pole", given | alone, 1)
+    assert env.unwrapped.given == vector.unwrapped.envs[0].unwrapped.given == ["a", "b", "c", "d"]
+    vector.close()
+    close_env(env)
+
+
 def test_few_processes_play_many_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
     original = own_process.InOwnProcess.__init__
