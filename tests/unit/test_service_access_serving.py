@@ -69,19 +69,22 @@ def post(port: int, *headers: str, path: str = "/api/v1/sweeps") -> bytes:
 
 # -- bodies
 
+PATIENCE_S = 60.0
+"""Longer than httpx2's own 5 s: so long an answer may take on a busy machine."""
+
 
 def test_a_body_that_ends_half_way_makes_nothing(shared: Service) -> None:
     with listening(shared) as (_, port):
         for _ in range(20):
             say(port, post(port, "Content-Length: 100") + b'{"preset": "cartpole-ppo"}').close()
-        assert httpx2.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
+        assert httpx2.get(f"http://127.0.0.1:{port}{ME}", timeout=PATIENCE_S).status_code == 200
     assert shared.queue.jobs() == []
 
 
 def test_bodies_that_stay_away_are_given_up_and_hold_nobody_back(shared: Service) -> None:
     with listening(shared, limits=Limits(body_s=1.0)) as (_, port):
         slow = [say(port, post(port, "Content-Length: 100") + b'{"preset"') for _ in range(100)]
-        assert httpx2.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
+        assert httpx2.get(f"http://127.0.0.1:{port}{ME}", timeout=PATIENCE_S).status_code == 200
         for connection in slow:
             assert heard(connection).startswith(b"HTTP/1.1 408 ")
     assert shared.queue.jobs() == []
@@ -113,7 +116,7 @@ def test_heads_that_are_none(shared: Service, head: str) -> None:
     with listening(shared) as (_, port):
         request = head.replace("PORT", str(port)) + "\r\nConnection: close\r\n\r\n"
         assert heard(say(port, request.encode())).split()[1] == b"400"
-        assert httpx2.get(f"http://127.0.0.1:{port}{ME}").status_code == 200
+        assert httpx2.get(f"http://127.0.0.1:{port}{ME}", timeout=PATIENCE_S).status_code == 200
 
 
 # -- proxies
