@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, NoReturn
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
+from policies.child_processes import BEGINNING, how_it_ended
 from policies.envs.faults import Frame, note_signals, place_in_env, set_place
 from policies.envs.modules import allow_modules, allowed_modules
 from policies.envs.rendering import choose_before_import, draw_without_display
@@ -34,14 +35,9 @@ OWN_PROCESS = "own_process"
 _PATIENCE_S = 5.0
 """How long the process may take to close its environment."""
 _THREADS = "OMP_NUM_THREADS"
-# As for the guard's child: nothing in the working directory can hide this package.
-_BOOTSTRAP = """\
-import sys
-sys.path.insert(0, {root!r})
-import policies
-del sys.path[0]
+_BOOTSTRAP = f"""{BEGINNING}\
 from policies.envs.own_process import serve
-serve({parent}, {connection}, by_kernel={by_kernel})
+serve({{parent}}, {{connection}}, by_kernel={{by_kernel}})
 """
 
 
@@ -153,11 +149,7 @@ class InOwnProcess(gym.Env[Any, Any]):
 
     def _how_it_ended(self) -> str:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            code = self._process.wait(_PATIENCE_S)
-            if code < 0:
-                with contextlib.suppress(ValueError):
-                    return f"was killed by {signal.Signals(-code).name}"
-            return f"ended with exit code {code}"
+            return how_it_ended(self._process.wait(_PATIENCE_S))
         return "does not answer any more"
 
 

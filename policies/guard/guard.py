@@ -28,6 +28,7 @@ from multiprocessing.connection import Pipe
 from pathlib import Path
 from typing import IO, Any, Self
 
+from policies.child_processes import BEGINNING
 from policies.envs.calls import PAGE_BYTES, Call, Page
 from policies.envs.modules import ENVIRONMENT_VARIABLE, allowed_modules, module_folders
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
@@ -46,14 +47,9 @@ _PATIENCE_S = 5.0
 _TRACEBACK_S = 1.0
 _MAX_FRAMES = 8
 _PACKAGE = Path(__file__).parents[1]
-# With `-P`, nothing in the working directory can hide this package. The user's folders are added later.
-_BOOTSTRAP = """\
-import sys
-sys.path.insert(0, {root!r})
-import policies
-del sys.path[0]
+_BOOTSTRAP = f"""{BEGINNING}\
 from policies.guard.child import main
-main({parent}, {connection}, {page}, {dump})
+main({{parent}}, {{connection}}, {{page}}, {{dump}})
 """
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
-from policies.child_processes import entry
+from policies.child_processes import entry, how_it_ended
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules, allowed_modules
 from policies.errors import EnvError
@@ -78,10 +78,7 @@ class ProcessHost:
     def _died(self) -> HostDiedError:
         self._process.join(_PATIENCE_S)
         code = self._process.exitcode
-        how = "ended" if code is None else f"ended with exit code {code}"
-        if code is not None and code < 0:
-            with contextlib.suppress(ValueError):
-                how = f"was killed by {signal.Signals(-code).name}"
+        how = "ended" if code is None else how_it_ended(code)
         return HostDiedError(
             f"A process that stepped environments of {self._env_id} {how}.",
             "Look for errors of the env in the trial's log, and check this machine's free memory.",
