@@ -19,7 +19,7 @@ from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import FORBIDDEN
 from policies.envs.own_actions import Choices
-from policies.envs.rendering import draw_without_display
+from policies.envs.rendering import draw_without_display, without_alpha
 from policies.errors import EnvError, said_by
 
 ScoreKind = Literal["probabilities", "values", "advantages", "gaussian"]
@@ -153,13 +153,13 @@ def _steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, draws: bool, st
 
 def _picture(env: gym.Env[Any, Any]) -> str | None:
     try:
-        frame = np.asarray(env.render())
+        frame = without_alpha(env.render())
     except Exception as error:  # an env may raise anything
         env_id = env.spec.id if env.spec is not None else "The env"
         raise EnvError(
             f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.", "Mend its render()."
         ) from error
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+    if frame is None:
         return None
     picture = Image.fromarray(frame)
     picture.thumbnail((_MAX_PIXELS, _MAX_PIXELS))

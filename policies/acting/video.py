@@ -15,7 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -24,7 +23,7 @@ from policies.acting.movies import GifWriter, Mp4Writer, fitted
 from policies.acting.policy import Policy
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
-from policies.envs.rendering import display_hint, draw_without_display
+from policies.envs.rendering import display_hint, draw_without_display, without_alpha
 from policies.errors import EnvError, SpecError, said_by
 
 _HOLD_S = 1.0  # the last picture stays, so that the final return can be read
@@ -84,6 +83,7 @@ def record_video(
     filmed = check_seeds([seeds] if isinstance(seeds, int | np.integer) else seeds)
     title = policy.description if caption is None else caption
     ends = []
+    _check_drawable(env_id, env_args)
     with ExitStack() as stack:
         stage = stack.enter_context(_Stage(policy, env_id, env_args, title, max_steps))
         film = stack.enter_context(_Film(mp4, gif, stage.fps if fps is None else fps))
@@ -132,6 +132,8 @@ def record_comparison(
         CannotRunError: A file cannot be written, or there is no video encoder.
     """
     (seed,) = check_seeds([seed])
+    # Before either is made: what is closed may close a display that all environments of the process draw on.
+    _check_drawable(env_id, env_args)
     with ExitStack() as stack:
         stages = [
             stack.enter_context(_Stage(policy, env_id, env_args, title, max_steps))
@@ -164,7 +166,10 @@ class _Stage:
         max_steps: int | None,
     ) -> None:
         self._policy, self._title = policy, title
-        self._env = _make_drawable_env(env_id, env_args)
+        with warnings.catch_warnings():
+            # Gymnasium warns of a render mode that the env does not list; it was refused before.
+            warnings.simplefilter("ignore")
+            self._env = make_env(env_id, env_args, render_mode="rgb_array")
         self._size: tuple[int, int] | None = None
         try:
             check_policy(policy, self._env)
@@ -188,7 +193,8 @@ class _Stage:
     def _draw(self) -> Image.Image:
         env_id = self._env.spec.id if self._env.spec is not None else "The env"
         try:
-            frame = np.asarray(self._env.render())
+            drawn: Any = self._env.render()
+            frame = without_alpha(drawn)
         except Exception as error:  # an env may raise anything
             raise EnvError(
                 f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
@@ -196,9 +202,9 @@ class _Stage:
                 or "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
                 "libosmesa6).",
             ) from error
-        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        if frame is None:
             raise EnvError(
-                f"{env_id} draws arrays of shape {frame.shape} and dtype {frame.dtype}, not frames.",
+                f"{env_id} draws arrays of shape {np.shape(drawn)} and dtype {np.asarray(drawn).dtype}, not frames.",
                 "Mend its render(): it must return a uint8 array (height, width, 3).",
             )
         picture = Image.fromarray(frame)
@@ -242,20 +248,18 @@ class _Film:
             self._gif.add(lambda: _picture(panels, scale), hold_s=_HOLD_S if last else 0.0)
 
 
-def _make_drawable_env(env_id: str, env_args: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
+def _check_drawable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
     draw_without_display()
     with warnings.catch_warnings():
-        # Gymnasium warns of an unknown render mode; it is an error here, raised below.
         warnings.simplefilter("ignore")
         plain = make_env(env_id, env_args)
-        modes = list(plain.metadata.get("render_modes") or [])
-        close_env(plain)
-        if "rgb_array" not in modes:
-            raise EnvError(
-                f"{env_id} cannot be filmed: it has no render mode 'rgb_array' (it has: {', '.join(modes) or 'none'}).",
-                "Evaluate it without a video, or add the render mode to the env.",
-            )
-        return make_env(env_id, env_args, render_mode="rgb_array")
+    modes = list(plain.metadata.get("render_modes") or [])
+    close_env(plain)
+    if "rgb_array" not in modes:
+        raise EnvError(
+            f"{env_id} cannot be filmed: it has no render mode 'rgb_array' (it has: {', '.join(modes) or 'none'}).",
+            "Evaluate it without a video, or add the render mode to the env.",
+        )
 
 
 def _in_step(plays: Sequence[Iterator[_Panel]]) -> Iterator[list[_Panel]]:

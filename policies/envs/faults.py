@@ -15,6 +15,7 @@ from traceback import walk_tb
 from types import FrameType
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 from gymnasium.error import DependencyNotInstalled
 
 from policies.envs.rendering import display_hint
@@ -23,6 +24,12 @@ from policies.errors import EnvFailedError, said_by
 _PACKAGE = PurePath(__file__).parents[1]
 _ONE_ALONE = re.compile("(?i)(per|same|each|one|single) process")
 """In an error of an env that can't be in a process twice, such as stable-retro's."""
+_PYGAME_IS_CLOSED = re.compile("display Surface quit|(?:video system|font|mixer) not initialized")
+"""What pygame says once an environment of the process has called `pygame.quit()`, which closes what all draw on."""
+_OLDER_NUMPY = re.compile(
+    "module '?numpy'? has no attribute|removed in the NumPy|only 0-dimensional arrays can be converted"
+)
+"""What NumPy says to code that was written for a version before it."""
 _PLACE = "_place_in_its_process"
 _notes_signals = False
 _signalled = False
@@ -86,13 +93,29 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
 
 def known_hint(error: BaseException) -> str | None:
     """Return what to do about an error of an env that lacks a package, a display or room; None: another one."""
+    said = said_by(error)
+    if _PYGAME_IS_CLOSED.search(said):
+        return (
+            "pygame has one display for all environments of a process, and another one has closed it: give each a "
+            "process of its own: env.own_process: true."
+        )
     if (hint := display_hint(error)) is not None:
         return hint
-    if _ONE_ALONE.search(said_by(error)):
+    if _ONE_ALONE.search(said):
         return "If a process can hold one such environment only, give each a process of its own: env.own_process: true."
     if isinstance(error, ImportError | DependencyNotInstalled):
         return "Install the package that the message names, on every machine that runs trials."
-    return None
+    return numpy_hint(error)
+
+
+def numpy_hint(error: BaseException) -> str | None:
+    """Return what to do about an error of code that was written for an older NumPy; None: it is none such."""
+    if _OLDER_NUMPY.search(said_by(error)) is None:
+        return None
+    return (
+        f"It is written for a NumPy older than {np.__version__}: install a newer release of it, or an older NumPy, "
+        "on every machine that runs trials."
+    )
 
 
 def place_in_env(error: BaseException) -> Frame | None:

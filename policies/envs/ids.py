@@ -10,6 +10,8 @@ import contextlib
 from collections.abc import Iterable
 from functools import partial
 from importlib.util import find_spec
+from inspect import isfunction
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
@@ -108,15 +110,31 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
     raise EnvError(
         f"The module {module_name!r} neither registers an environment {name!r} with Gymnasium nor has a class of that "
         f"name that is a gymnasium.Env.{_nearest_ids(name, [*classes, *gym.registry])}",
-        "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
+        _if_it_registers(module)
+        or "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
     )
+
+
+def _if_it_registers(module: ModuleType) -> str:
+    """Return what to do with a module that has a function to register its environments; "": it has none."""
+    for name, value in vars(module).items():
+        if name.startswith("register") and isfunction(value) and _share_package(value.__module__, module.__name__):
+            return (
+                f"Correct the name after the colon, or, if {module.__name__}.{name}() registers it, call that in a "
+                "module of your own, which then goes before the colon."
+            )
+    return ""
 
 
 def _is_registered_by(env_id: str, *modules: str) -> bool:
     """Whether the environment of a registered id is made by the package of one of these modules."""
     entry = gym.registry[env_id].entry_point
     maker = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
-    return maker.partition(".")[0] in {module.partition(".")[0] for module in modules}
+    return any(_share_package(maker, module) for module in modules)
+
+
+def _share_package(module: str, other: str) -> bool:
+    return module.partition(".")[0] == other.partition(".")[0]
 
 
 def _namespace_module(env_id: str) -> str | None:

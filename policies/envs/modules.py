@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from policies.arguments import checked
-from policies.envs.faults import is_of_env
+from policies.envs.faults import is_of_env, numpy_hint
 from policies.envs.rendering import display_hint
 from policies.errors import SpecError, said_by
 
@@ -165,7 +165,7 @@ def _is_part(missing: str | None, module: str) -> bool:
 def _failed(module: str, error: BaseException) -> SpecError:
     return SpecError(
         f"The module {module!r} cannot be imported: {type(error).__name__}: {said_by(error)}.",
-        display_hint(error) or f'Try `python -c "import {module}"`, and mend what it says.',
+        display_hint(error) or numpy_hint(error) or f'Try `python -c "import {module}"`, and mend what it says.',
     )
 
 

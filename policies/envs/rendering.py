@@ -13,6 +13,9 @@ from functools import cache
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from policies.errors import said_by
 
 _Made = TypeVar("_Made")
@@ -95,6 +98,17 @@ def display_hint(error: BaseException) -> str | None:
     return (
         "It wants a display, and there is none here: `xvfb-run -a tune-jobs ...` gives it one (Debian's xvfb, xauth)."
     )
+
+
+def without_alpha(drawn: Any) -> NDArray[np.uint8] | None:
+    """Return a picture (rows, columns, 3) of what an env drew, which may have a fourth channel, as matplotlib's has.
+
+    None: it is no picture, but has another shape or other numbers than bytes.
+    """
+    picture = np.asarray(drawn)
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4) or picture.dtype != np.uint8 or picture.size == 0:
+        return None
+    return picture[:, :, :3]
 
 
 def _lacks_display() -> bool:

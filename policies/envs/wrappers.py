@@ -211,13 +211,13 @@ class ObservePixels(gym.ObservationWrapper[Any, Any, Any]):
         """Return the picture of this moment in place of the environment's own observation."""
         del observation
         picture: Any = self.env.render()
-        if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] != 3:
+        if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] not in (3, 4):
             raise EnvError(
                 f"{_name(self.env)} has pixels: true, but renders {type(picture).__name__} of shape "
                 f"{np.shape(picture)}, not a picture of shape (rows, columns, 3).",
                 "Mend its render() for the mode 'rgb_array', or leave pixels out.",
             )
-        return shrink_to_grey(picture)
+        return shrink_to_grey(picture[:, :, :3])  # a fourth channel is matplotlib's
 
 
 def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.spaces.Box:

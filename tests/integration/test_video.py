@@ -8,16 +8,18 @@ from typing import Any, cast
 import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
+import pygame
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs
+from policy_factory import balancing_policy, make_policy, make_portable, register_test_envs, registered
 
 import policies.acting.movies
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.movies import GifWriter, Mp4Writer
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.acting.video import record_comparison, record_video
+from policies.envs.faults import env_failed
 from policies.errors import CannotRunError, EnvError, NonFiniteWeightsError, SpecError
 
 register_test_envs()
@@ -123,6 +125,60 @@ def test_tiny_frames_are_enlarged(tmp_path: Path) -> None:
     assert meta["size"][0] == 330
     assert gif_frames(tmp_path / "a.gif")[0][0] == 280
     assert len(frames) == 6 + 20
+
+
+class OnOneDisplay(gym.Env[Any, Any]):
+    """What is drawn on pygame's display, of which a process has one, and closes that with itself."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 (Gymnasium's)
+    observation_space = gym.spaces.Box(0, 255, (2,), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        pygame.init()
+        self.screen = pygame.display.set_mode((40, 30))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        self.screen.fill((9, 9, 9))
+        return np.zeros(2, np.uint8), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        self.screen.fill((9, 9, 9))
+        return np.full(2, self.steps, np.uint8), 1.0, self.steps == 5, False, {}
+
+    def render(self) -> Any:
+        return np.transpose(pygame.surfarray.array3d(self.screen), (1, 0, 2))
+
+    def close(self) -> None:
+        pygame.quit()
+
+
+def test_two_that_share_a_display_are_filmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with registered("TestDisplay-v0", OnOneDisplay):
+        # That one closes the other's display is what this is about.
+        first, second = gym.make("TestDisplay-v0"), gym.make("TestDisplay-v0")
+        second.close()
+        with pytest.raises(pygame.error, match="display Surface quit") as failure:
+            first.reset()
+        assert "env.own_process: true" in env_failed("It failed", failure.value).hint
+        results = record_comparison(
+            RandomPolicy.for_env("TestDisplay-v0"),
+            RandomPolicy.for_env("TestDisplay-v0"),
+            env_id="TestDisplay-v0",
+            seed=1,
+            captions=("left", "right"),
+            left_mp4=tmp_path / "left.mp4",
+            right_mp4=tmp_path / "right.mp4",
+            right_gif=tmp_path / "right.gif",
+            both_mp4=tmp_path / "both.mp4",
+        )
+    assert [result.returns for result in results] == [(5.0,), (5.0,)]
+    assert len(read_mp4(tmp_path / "both.mp4")[1]) == 6 + 30
 
 
 def test_an_env_without_pictures_is_refused(tmp_path: Path) -> None:

@@ -248,6 +248,36 @@ def test_a_name_that_is_no_env_of_the_module_is_refused(own: Path, name: str, gu
         make_env(f"own_walks:{name}")
 
 
+@pytest.mark.parametrize(
+    ("source", "named"),
+    [
+        ("from own_registering.parts import *", True),
+        ("def register_envs(): pass", True),
+        ("from gymnasium import register, register_envs", False),
+        ("registered = True", False),
+        ("class register: pass", False),
+        ("def deregister(): pass", False),
+    ],
+)
+def test_a_function_of_the_module_that_may_register_it_is_named(own: Path, source: str, *, named: bool) -> None:
+    (own / "own_registering").mkdir()
+    (own / "own_registering" / "parts.py").write_text("def register_envs(): pass\n")
+    (own / "own_registering" / "__init__.py").write_text(source)
+    allow_modules(["own_registering"])
+    with pytest.raises(EnvError, match="neither registers an environment 'Walk-v0'") as failure:
+        make_env("own_registering:Walk-v0")
+    assert ("if own_registering.register_envs() registers it" in failure.value.hint) is named
+    assert ("call gymnasium.register in the module" in failure.value.hint) is not named
+
+
+def test_a_module_for_an_older_numpy_is_refused_with_what_to_do(own: Path) -> None:
+    (own / "own_old.py").write_text("import numpy as np\nWHOLE = np.no_such_type\n")
+    allow_modules(["own_old"])
+    with pytest.raises(EnvError, match="no attribute 'no_such_type'") as failure:
+        make_env("own_old:Walk-v0")
+    assert "written for a NumPy older than" in failure.value.hint
+
+
 def test_a_class_becomes_its_path_and_allows_its_module(own: Path) -> None:
     allow_modules(["own_walks"])
     walk = import_allowed("own_walks:Walk")

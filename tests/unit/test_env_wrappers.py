@@ -210,6 +210,15 @@ def test_pictures_of_any_size_shrink_to_few_rows_and_columns(shape: tuple[int, i
     assert np.unique(shrink_to_grey(picture)).tolist() == [77]
 
 
+def test_pixels_are_those_of_a_picture_without_its_alpha_channel(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = np.random.default_rng(1).integers(0, 256, (130, 65, 4), np.uint8)
+    observations = []
+    for channels in (3, 4):
+        monkeypatch.setattr(Counter, "render", lambda self, drawn=plain[:, :, :channels]: drawn)
+        observations.append(make_env("TestCounter-v0", {"pixels": True}).reset()[0])
+    np.testing.assert_array_equal(*observations)
+
+
 def test_pixels_show_what_the_env_renders_and_a_video_shows_all_of_it() -> None:
     env = make_env("TestCounter-v0", {"pixels": True, "frame_stack": 2}, render_mode="rgb_array")
     assert env.observation_space == gym.spaces.Box(0, 255, (43, 21, 2), np.uint8)

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from policies.errors import EnvFailedError, TuneJobsError, fit, said_by, tellable
@@ -54,6 +55,40 @@ def test_an_envs_error_can_be_told(error: ValueError | MuteError | WordlessError
     assert isinstance(failed, EnvFailedError)
     assert len(failed.message) < 3_000
     json.dumps(failed.message, ensure_ascii=False).encode()
+
+
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        (RuntimeError("display Surface quit"), "env.own_process: true"),
+        (RuntimeError("video system not initialized"), "env.own_process: true"),
+        (RuntimeError("font not initialized"), "env.own_process: true"),
+        (AttributeError("module 'numpy' has no attribute 'bool8'. Did you mean: 'bool'?"), "an older NumPy"),
+        (
+            AttributeError("`np.float_` was removed in the NumPy 2.0 release. Use `np.float64` instead."),
+            "an older NumPy",
+        ),
+        (TypeError("only 0-dimensional arrays can be converted to Python scalars"), "an older NumPy"),
+        (ImportError("libfoo is not there"), "Install the package"),
+        (AttributeError("module 'nump' has no attribute 'bool8'"), None),
+        (ValueError("the network is not initialized"), None),
+        (MuteError(), None),
+    ],
+)
+def test_what_to_do_about_an_error_of_an_env_is_known_by_its_words(error: Exception, advice: str | None) -> None:
+    from policies.envs.faults import known_hint
+
+    hint = known_hint(error)
+    assert (hint is None) == (advice is None)
+    assert (advice or "") in (hint or "")
+
+
+def test_numpy_says_what_the_hint_goes_by() -> None:
+    from policies.envs.faults import numpy_hint
+
+    said = caught(lambda: np.no_such_type)  # type: ignore[attr-defined]
+    assert said is not None
+    assert f"older than {np.__version__}" in str(numpy_hint(said))
 
 
 def caught(raise_it: Callable[[], Any]) -> Exception | None:

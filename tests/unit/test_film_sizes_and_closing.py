@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -111,6 +114,31 @@ def test_a_film_of_an_env_whose_pictures_grow(tmp_path: Path) -> None:
         # The caption stays where it is, and as large as it is.
         assert frame[4:22, -80:].max() > 150
         assert np.abs(frame[:26, 200] - (24, 27, 34)).max() < 40
+    assert Grows.num_open == 0
+
+
+def test_pictures_with_an_alpha_channel_are_filmed_and_shown_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_alpha = np.full((60, 340, 4), (*RED, 0), np.uint8)
+    monkeypatch.setattr(Grows, "render", lambda self: with_alpha)
+    record_video(policy(), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4")
+    for frame in frames_of(tmp_path / "a.mp4"):
+        assert np.abs(frame[40:70, 150:190] - RED).max() < 40
+    for step in watch_episode(policy(), ENV, {}, 0)[1]:
+        with Image.open(io.BytesIO(base64.b64decode(step.picture or ""))) as picture:
+            assert np.abs(np.array(picture).astype(int) - RED).max() < 40
+
+
+@pytest.mark.parametrize("shape", [(0, 0, 3), (60, 0, 3), (60, 80, 2), (60, 80, 5)])
+def test_pictures_of_other_shapes_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, ...]
+) -> None:
+    monkeypatch.setattr(Grows, "render", lambda self: np.zeros(shape, np.uint8))
+    with pytest.raises(EnvError, match=f"draws arrays of shape {re.escape(str(shape))}"):
+        record_video(policy(), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4")
+    assert {step.picture for step in watch_episode(policy(), ENV, {}, 0)[1]} == {None}
+    assert list(tmp_path.iterdir()) == []
     assert Grows.num_open == 0
 
 
