@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from policies.envs import modules
 from policies.errors import EnvError
 from policies.hyperparams import Algorithm, DQNHyperparams, PPOHyperparams
 
@@ -30,6 +31,12 @@ ENVS: dict[str, tuple[str, dict[str, Any], int, str]] = {
     "ticks": ("TestTicks-v0", {"end": 4}, 3, "sync"),
 }
 CASES = [pytest.param("ppo", env, id=env) for env in ENVS]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What other tests of this process allowed would be among the env's arguments, which RLlib's runner hands on."""
+    monkeypatch.setattr(modules, "_allowed", set())
 
 
 def make_config(algorithm: Algorithm, env: str) -> Any:
