@@ -9,7 +9,10 @@ from typing import Any
 import pytest
 
 from analysis.records import ReplicationRecord
+from policies.acting.evaluate import MAX_EPISODE_STEPS
 from policies.errors import CannotRunError, EnvError, SpecError
+from policies.guard import guarded
+from policies.packed.envs.make import StepTime
 from tune_jobs.plan import machine as machine_module
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.points import trial_id
@@ -43,6 +46,29 @@ def test_each_trial_has_all_hyperparameters_its_point_among_them() -> None:
         assert {name: trial.hyperparams[name] for name in trial.point} == trial.point
         assert sorted(trial.point) == ["activation", "hidden_sizes", "lr"]
     json.dumps(plan().to_json())
+
+
+@pytest.mark.parametrize(
+    ("env", "step_us", "is_told"),
+    [
+        ({"id": "Blackjack-v1"}, 6000.0, True),
+        ({"id": "Blackjack-v1"}, 5999.0, False),
+        ({"id": "Blackjack-v1"}, None, False),
+        ({"id": "Blackjack-v1", "args": {"max_episode_steps": 500}}, 6000.0, False),
+        ({"id": "Taxi-v3"}, 6000.0, False),
+    ],
+)
+def test_slow_episodes_that_may_never_end_are_noted(
+    env: dict[str, Any], step_us: float | None, *, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guarded, "measure_step", lambda *_, timeout_s: StepTime(step_us))
+    made = plan(source={"env": env, "algorithm": "dqn", "evaluation": {"num_episodes": 7}})
+    notes = [note for note in made.notes if "sets no limit to the env steps of an episode" in note]
+    assert bool(notes) is is_told
+    for note in notes:
+        assert "one takes 6.0 ms" in note
+        assert f"cut off after {MAX_EPISODE_STEPS:,}, which take 1 min" in note
+        assert "Each evaluation plays 7 episodes" in note
 
 
 def test_seeds_per_point_repeat_a_point_with_other_seeds() -> None:

@@ -8,7 +8,8 @@ from typing import Any, TypeGuard
 import gymnasium as gym
 import numpy as np
 
-from analysis.wording import counted
+from analysis.wording import counted, duration
+from policies.acting.evaluate import MAX_EPISODE_STEPS
 from policies.envs.flat import FlatBox, leaves, named
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
@@ -22,12 +23,13 @@ _IMAGE = 3
 """The dimensions of an image."""
 _MOST_CHANNELS = 16
 """Of an image: four frames in colour. NetHack's texts are of three dimensions, too, none of which is as small."""
+_LONG_EPISODE_S = 60.0
 _FEW_NUMBERS = 3_000
 """An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
 
 
-def env_notes(spec: SweepSpec, env: EnvInfo) -> list[str]:
-    """Return notes on a sweep's environment, with its wrappers."""
+def env_notes(spec: SweepSpec, env: EnvInfo, step_us: float | None = None) -> list[str]:
+    """Return notes on a sweep's environment, with its wrappers; `step_us` is how long an env step takes, if known."""
     notes = []
     seen = seen_by_networks(env.observation_space)
     if isinstance(seen, FlatBox):
@@ -52,6 +54,15 @@ def env_notes(spec: SweepSpec, env: EnvInfo) -> list[str]:
             f"{env.env_id} gives info[{env.unused_mask!r}], which seems to say which actions are allowed, and which is "
             "not used: env.action_mask: true uses it."
         )
+    if step_us is not None and env.max_episode_steps is None:
+        longest_s = step_us / 1e6 * MAX_EPISODE_STEPS
+        if longest_s >= _LONG_EPISODE_S:
+            notes.append(
+                f"{env.env_id} sets no limit to the env steps of an episode, and one takes {step_us / 1000:.1f} ms: an "
+                f"episode that does not end by itself is cut off after {MAX_EPISODE_STEPS:,}, which take "
+                f"{duration(longest_s)}. Each evaluation plays {counted(spec.evaluation.num_episodes, 'episode')}, the "
+                "end of the sweep more; env.args.max_episode_steps sets a limit."
+            )
     target = spec.stop.training_return
     if env.threshold is not None and target is not None and target < env.threshold:
         notes.append(

@@ -223,7 +223,7 @@ def make_plan(
         env=env,
         machine=machine,
         notes=(
-            *_notes(spec, env, concurrent if packs is None else None),
+            *_notes(spec, env, packs, concurrent),
             *idle_settings(spec),
             *comparison_notes(spec, ((own, each) for own, values in zip(specs, sizes, strict=True) for each in values)),
             *idle,
@@ -363,14 +363,10 @@ def _largest(
     return [known[id(values)] for values in sizes]
 
 
-def _notes(spec: SweepSpec, env: EnvInfo, concurrent: int | None) -> list[str]:
-    """Return notes on the sweep; `concurrent` is how many trials run at once, or None if packs need no such note."""
-    notes = [*repeated_points_notes(spec), *env_notes(spec, env)]
+def _notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None, concurrent: int) -> list[str]:
+    """Return notes on the sweep; `concurrent` is how many trials run at once."""
+    notes = [*repeated_points_notes(spec), *env_notes(spec, env, None if packs is None else packs.env_step_us)]
     wanted = spec.resources.max_concurrent
-    if (
-        wanted is not None
-        and concurrent is not None
-        and concurrent < min(wanted, num_points_of(spec) * spec.seeds_per_point)
-    ):
+    if wanted is not None and packs is None and concurrent < min(wanted, num_points_of(spec) * spec.seeds_per_point):
         notes.append(f"resources.max_concurrent is {wanted}, but only {counted(concurrent, 'trial')} can run at once.")
     return notes
