@@ -13,13 +13,14 @@ import numpy as np
 from PIL import Image
 
 from policies.acting.evaluate import EndedBy, check_policy, check_seeds, episode_cap, episode_steps
+from policies.acting.movies import enlarged
 from policies.acting.policy import Action, NetworkPolicy, Policy
 from policies.envs.action_names import action_names
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import FORBIDDEN
 from policies.envs.own_actions import Choices
-from policies.envs.rendering import draw_without_display, without_alpha
+from policies.envs.rendering import draw_without_display, picture_of
 from policies.errors import EnvError, said_by
 
 ScoreKind = Literal["probabilities", "values", "advantages", "gaussian"]
@@ -153,7 +154,7 @@ def _steps(policy: Policy, env: gym.Env[Any, Any], seed: int, *, draws: bool, st
 
 def _picture(env: gym.Env[Any, Any]) -> str | None:
     try:
-        frame = without_alpha(env.render())
+        frame = picture_of(env.render())
     except Exception as error:  # an env may raise anything
         env_id = env.spec.id if env.spec is not None else "The env"
         raise EnvError(
@@ -161,7 +162,7 @@ def _picture(env: gym.Env[Any, Any]) -> str | None:
         ) from error
     if frame is None:
         return None
-    picture = Image.fromarray(frame)
+    picture = enlarged(Image.fromarray(frame))
     picture.thumbnail((_MAX_PIXELS, _MAX_PIXELS))
     file = io.BytesIO()
     picture.save(file, "JPEG", quality=_JPEG_QUALITY)

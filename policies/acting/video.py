@@ -19,16 +19,15 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from policies.acting.evaluate import Episodes, check_policy, check_seeds, episode_cap, episode_steps
-from policies.acting.movies import GifWriter, Mp4Writer, fitted
+from policies.acting.movies import GifWriter, Mp4Writer, enlarged, fitted
 from policies.acting.policy import Policy
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
-from policies.envs.rendering import display_hint, draw_without_display, without_alpha
+from policies.envs.rendering import display_hint, draw_without_display, picture_of
 from policies.errors import EnvError, SpecError, said_by
 
 _HOLD_S = 1.0  # the last picture stays, so that the final return can be read
 _DEFAULT_FPS = 30.0
-_MIN_WIDTH = 320  # smaller frames are enlarged, or the caption would not fit
 _GIF_SCALE = 0.5
 _GIF_MIN_WIDTH = 280
 _BACKGROUND = (24, 27, 34)
@@ -194,7 +193,7 @@ class _Stage:
         env_id = self._env.spec.id if self._env.spec is not None else "The env"
         try:
             drawn: Any = self._env.render()
-            frame = without_alpha(drawn)
+            frame = picture_of(drawn)
         except Exception as error:  # an env may raise anything
             raise EnvError(
                 f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
@@ -205,12 +204,9 @@ class _Stage:
         if frame is None:
             raise EnvError(
                 f"{env_id} draws arrays of shape {np.shape(drawn)} and dtype {np.asarray(drawn).dtype}, not frames.",
-                "Mend its render(): it must return a uint8 array (height, width, 3).",
+                "Mend its render(): it must return a uint8 array (height, width, 3), or floats of 0 to 1.",
             )
-        picture = Image.fromarray(frame)
-        zoom = -(-_MIN_WIDTH // picture.width)
-        if zoom > 1:
-            picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
+        picture = enlarged(Image.fromarray(frame))
         # Here and not only where it is written, or the caption would be scaled with it.
         self._size = self._size or picture.size
         return fitted(picture, self._size)

@@ -100,15 +100,21 @@ def display_hint(error: BaseException) -> str | None:
     )
 
 
-def without_alpha(drawn: Any) -> NDArray[np.uint8] | None:
-    """Return a picture (rows, columns, 3) of what an env drew, which may have a fourth channel, as matplotlib's has.
+def picture_of(drawn: Any) -> NDArray[np.uint8] | None:
+    """Return a picture (rows, columns, 3) of what an env drew; None: it is no picture.
 
-    None: it is no picture, but has another shape or other numbers than bytes.
+    As matplotlib's, it may have a fourth channel, for what shines through, which is left out, and its numbers may be
+    floating-point numbers of 0 to 1, as MinAtar's are, in place of bytes.
     """
     picture = np.asarray(drawn)
-    if picture.ndim != 3 or picture.shape[2] not in (3, 4) or picture.dtype != np.uint8 or picture.size == 0:
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4) or picture.size == 0:
         return None
-    return picture[:, :, :3]
+    colours = picture[:, :, :3]
+    if colours.dtype == np.uint8:
+        return colours
+    if np.issubdtype(colours.dtype, np.floating) and colours.min() >= 0 and colours.max() <= 1:
+        return np.round(255 * colours).astype(np.uint8)
+    return None
 
 
 def _lacks_display() -> bool:

@@ -27,6 +27,7 @@ from policies.envs.flat import flattened
 from policies.envs.masks import ACTION_MASK, MaskedBox, Setting, check_setting, masked, num_masked
 from policies.envs.own_actions import with_own_actions
 from policies.envs.own_process import OWN_PROCESS
+from policies.envs.rendering import picture_of
 from policies.envs.training_view import TrainingView
 from policies.errors import EnvError
 
@@ -217,7 +218,8 @@ class ObservePixels(gym.ObservationWrapper[Any, Any, Any]):
                 f"{np.shape(picture)}, not a picture of shape (rows, columns, 3).",
                 "Mend its render() for the mode 'rgb_array', or leave pixels out.",
             )
-        return shrink_to_grey(picture[:, :, :3])  # a fourth channel is matplotlib's
+        seen = picture_of(picture)
+        return shrink_to_grey(picture[:, :, :3] if seen is None else seen)
 
 
 def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.spaces.Box:

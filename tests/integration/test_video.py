@@ -19,7 +19,7 @@ from policies.acting.evaluate import evaluate_policy
 from policies.acting.movies import GifWriter, Mp4Writer
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.acting.video import record_comparison, record_video
-from policies.envs.faults import env_failed
+from policies.envs.faults import close_env, env_failed
 from policies.errors import CannotRunError, EnvError, NonFiniteWeightsError, SpecError
 
 register_test_envs()
@@ -162,7 +162,7 @@ def test_two_that_share_a_display_are_filmed(tmp_path: Path, monkeypatch: pytest
     with registered("TestDisplay-v0", OnOneDisplay):
         # That one closes the other's display is what this is about.
         first, second = gym.make("TestDisplay-v0"), gym.make("TestDisplay-v0")
-        second.close()
+        close_env(second)
         with pytest.raises(pygame.error, match="display Surface quit") as failure:
             first.reset()
         assert "env.own_process: true" in env_failed("It failed", failure.value).hint
@@ -197,7 +197,7 @@ def test_an_env_that_raises_leaves_no_file(tmp_path: Path) -> None:
 def test_an_env_that_draws_no_frames_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from policy_factory import Walk
 
-    for drawn in (None, np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3))):
+    for drawn in (None, np.zeros((4, 4), np.uint8), np.full((4, 4, 3), 1.5)):
         monkeypatch.setattr(Walk, "render", lambda self, drawn=drawn: drawn)
         with pytest.raises(EnvError, match="TestWalk-v0 draws arrays of shape"):
             record_video(make_policy("TestWalk-v0"), env_id="TestWalk-v0", seeds=0, mp4=tmp_path / "a.mp4")

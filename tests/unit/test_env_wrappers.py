@@ -210,13 +210,14 @@ def test_pictures_of_any_size_shrink_to_few_rows_and_columns(shape: tuple[int, i
     assert np.unique(shrink_to_grey(picture)).tolist() == [77]
 
 
-def test_pixels_are_those_of_a_picture_without_its_alpha_channel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_are_the_same_in_every_form_of_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = np.random.default_rng(1).integers(0, 256, (130, 65, 4), np.uint8)
     observations = []
-    for channels in (3, 4):
-        monkeypatch.setattr(Counter, "render", lambda self, drawn=plain[:, :, :channels]: drawn)
+    for drawn in (plain[:, :, :3], plain, plain / 255, plain.astype(np.float64)):
+        monkeypatch.setattr(Counter, "render", lambda self, drawn=drawn: drawn)
         observations.append(make_env("TestCounter-v0", {"pixels": True}).reset()[0])
-    np.testing.assert_array_equal(*observations)
+    for others in observations[1:]:
+        np.testing.assert_array_equal(others, observations[0])
 
 
 def test_pixels_show_what_the_env_renders_and_a_video_shows_all_of_it() -> None:

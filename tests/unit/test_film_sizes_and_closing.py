@@ -20,7 +20,9 @@ from policies.acting.baselines import ConstantPolicy
 from policies.acting.live import watch_episode
 from policies.acting.movies import GifWriter, Mp4Writer, fitted
 from policies.acting.video import record_video
+from policies.envs.rendering import picture_of
 from policies.errors import EnvError
+from tests.narrowing import present
 
 ENV = "TestGrows-v0"
 RED = (200, 0, 0)
@@ -117,17 +119,47 @@ def test_a_film_of_an_env_whose_pictures_grow(tmp_path: Path) -> None:
     assert Grows.num_open == 0
 
 
-def test_pictures_with_an_alpha_channel_are_filmed_and_shown_without_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("drawn", [
+    np.full((60, 340, 4), (*RED, 0), np.uint8),
+    np.full((60, 340, 3), RED) / 255,
+    np.full((60, 340, 4), (*RED, 0), np.float32) / 255,
+])  # fmt: skip
+def test_pictures_as_matplotlib_knows_them_are_filmed_and_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, drawn: Any
 ) -> None:
-    with_alpha = np.full((60, 340, 4), (*RED, 0), np.uint8)
-    monkeypatch.setattr(Grows, "render", lambda self: with_alpha)
+    monkeypatch.setattr(Grows, "render", lambda self: drawn)
     record_video(policy(), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4")
     for frame in frames_of(tmp_path / "a.mp4"):
         assert np.abs(frame[40:70, 150:190] - RED).max() < 40
     for step in watch_episode(policy(), ENV, {}, 0)[1]:
         with Image.open(io.BytesIO(base64.b64decode(step.picture or ""))) as picture:
             assert np.abs(np.array(picture).astype(int) - RED).max() < 40
+
+
+def test_each_number_of_0_to_1_becomes_the_nearest_byte() -> None:
+    numbers = [0, 0.001, 0.0019, 0.5, 0.9981, 0.999, 1]
+    picture = present(picture_of(np.array(numbers).reshape(7, 1, 1) * np.ones(3)))
+    assert picture[:, 0, 0].tolist() == [0, 0, 0, 128, 255, 255, 255]
+
+
+def test_small_pictures_are_shown_with_squares_for_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = np.zeros((10, 10, 3), np.uint8)
+    drawn[3, 4] = RED
+    monkeypatch.setattr(Grows, "render", lambda self: drawn)
+    _, steps = watch_episode(policy(), ENV, {}, 0)
+    with Image.open(io.BytesIO(base64.b64decode(next(steps).picture or ""))) as picture:
+        pixels = np.array(picture).astype(int)
+    steps.close()  # type: ignore[attr-defined]
+    assert pixels.shape == (320, 320, 3)
+    assert np.abs(pixels[98:126, 130:158] - RED).max() < 40
+    assert pixels[:90].max() < 40
+
+
+@pytest.mark.parametrize("number", [-0.01, 1.01, np.nan, np.inf, 1])
+def test_other_numbers_are_no_picture(number: float) -> None:
+    drawn: Any = np.zeros((2, 2, 3), type(number))
+    drawn[1, 1, 1] = number
+    assert picture_of(drawn) is None
 
 
 @pytest.mark.parametrize("shape", [(0, 0, 3), (60, 0, 3), (60, 80, 2), (60, 80, 5)])
