@@ -26,6 +26,8 @@ from policies.envs.make import make_env
 from policies.envs.rendering import display_hint, draw_without_display, picture_of
 from policies.errors import EnvError, SpecError, said_by
 
+MAX_ENDLESS_STEPS = 3_000
+"""Env steps of an episode that are filmed where the env sets no limit to them: 100 s at 30 frames a second."""
 _HOLD_S = 1.0  # the last picture stays, so that the final return can be read
 _DEFAULT_FPS = 30.0
 _GIF_SCALE = 0.5
@@ -69,7 +71,7 @@ def record_video(
         gif: File to write (looping, half the size, at most about 3 MB); None: no GIF.
         caption: Text in the left half of the caption strip; None: the policy's description.
         fps: Frames a second; None: the env's `render_fps`, so that it plays in real time.
-        max_steps: Cap on the env steps of an episode; None: the same as in `evaluate_policy`.
+        max_steps: Cap on the env steps of an episode; None: the env's limit, or `MAX_ENDLESS_STEPS` if it sets none.
 
     Returns:
         The episodes that were filmed.
@@ -120,7 +122,7 @@ def record_comparison(
         right_mp4: File to write with the right episode alone.
         right_gif: File to write with the right episode as a GIF.
         both_mp4: File to write with the two side by side; the shorter one holds its last frame.
-        max_steps: Cap on the env steps of an episode; None: the same as in `evaluate_policy`.
+        max_steps: Cap on the env steps of an episode; None: the env's limit, or `MAX_ENDLESS_STEPS` if it sets none.
 
     Returns:
         The left policy's episodes and the right policy's episodes.
@@ -172,7 +174,8 @@ class _Stage:
         self._size: tuple[int, int] | None = None
         try:
             check_policy(policy, self._env)
-            self._cap = episode_cap(self._env, max_steps)
+            is_endless = self._env.spec is None or self._env.spec.max_episode_steps is None
+            self._cap = episode_cap(self._env, MAX_ENDLESS_STEPS if max_steps is None and is_endless else max_steps)
             self.fps = float(self._env.metadata.get("render_fps") or _DEFAULT_FPS)
         except BaseException:
             close_env(self._env)
@@ -187,7 +190,8 @@ class _Stage:
     def play(self, seed: int) -> Iterator[_Panel]:
         """Play the episode of a seed, and yield a panel for the reset and for each step."""
         for moment in episode_steps(self._policy, self._env, seed, max_episode_steps=self._cap):
-            yield _Panel(self._draw(), self._title, moment.num_env_steps, moment.total, moment.over)
+            title = f"cut off: {self._title}" if moment.ended_by == "cap" else self._title
+            yield _Panel(self._draw(), title, moment.num_env_steps, moment.total, moment.over)
 
     def _draw(self) -> Image.Image:
         env_id = self._env.spec.id if self._env.spec is not None else "The env"

@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 from policy_factory import registered
 
+from policies.acting import video
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.live import watch_episode
 from policies.acting.movies import GifWriter, Mp4Writer, fitted
@@ -172,6 +173,28 @@ def test_pictures_of_other_shapes_are_refused(
     assert {step.picture for step in watch_episode(policy(), ENV, {}, 0)[1]} == {None}
     assert list(tmp_path.iterdir()) == []
     assert Grows.num_open == 0
+
+
+@pytest.mark.parametrize(
+    ("max_steps", "steps", "is_cut"), [(None, 3, True), (2, 2, True), (4, 4, False), (9, 4, False)]
+)
+def test_without_a_limit_of_the_env_a_film_is_cut_off_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, max_steps: int | None, steps: int, *, is_cut: bool
+) -> None:
+    monkeypatch.setattr(video, "MAX_ENDLESS_STEPS", 3)
+    filmed = record_video(policy(), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4", max_steps=max_steps, caption="a")
+    assert filmed.lengths == (steps,)
+    before, last = (frame[:26, :150] for frame in (frames_of(tmp_path / "a.mp4")[index] for index in (steps - 1, -1)))
+    assert bool(np.abs(before - last).max() > 100) is is_cut
+
+
+def test_what_the_env_limits_itself_is_filmed_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "MAX_ENDLESS_STEPS", 2)
+    limited = {"max_episode_steps": 3}
+    filmed = record_video(policy(), env_id=ENV, env_args=limited, seeds=0, mp4=tmp_path / "a.mp4", caption="a")
+    assert filmed.lengths == (3,)
+    before, last = (frame[:26, :150] for frame in (frames_of(tmp_path / "a.mp4")[index] for index in (2, -1)))
+    assert np.abs(before - last).max() < 50
 
 
 def test_a_policy_that_cannot_be_filmed_leaves_no_env_open(tmp_path: Path) -> None:
