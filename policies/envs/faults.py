@@ -96,7 +96,7 @@ def known_hint(error: BaseException) -> str | None:
     said = said_by(error)
     if _PYGAME_IS_CLOSED.search(said):
         return (
-            "pygame has one display for all environments of a process, and another one has closed it: give each a "
+            "pygame has one display for all environments of a process: if another one has closed it, give each a "
             "process of its own: env.own_process: true."
         )
     if (hint := display_hint(error)) is not None:

@@ -118,7 +118,7 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
 def _if_it_registers(module: ModuleType) -> str:
     """Return what to do with a module that has a function to register its environments; "": it has none."""
     for name, value in vars(module).items():
-        if name.startswith("register") and isfunction(value) and _share_package(value.__module__, module.__name__):
+        if name.startswith("register") and isfunction(value) and _share_package(str(value.__module__), module.__name__):
             return (
                 f"Correct the name after the colon, or, if {module.__name__}.{name}() registers it, call that in a "
                 "module of your own, which then goes before the colon."

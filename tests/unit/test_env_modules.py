@@ -254,6 +254,7 @@ def test_a_name_that_is_no_env_of_the_module_is_refused(own: Path, name: str, gu
         ("from own_registering.parts import *", True),
         ("def register_envs(): pass", True),
         ("from gymnasium import register, register_envs", False),
+        ("exec('def register_envs(): pass', made := {}); register_envs = made['register_envs']", False),
         ("registered = True", False),
         ("class register: pass", False),
         ("def deregister(): pass", False),
