@@ -326,15 +326,20 @@ def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
     return result
 
 
-def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None) -> int:
+def episode_cap(env: gym.Env[Any, Any], max_episode_steps: int | None, *, unlimited: int = MAX_EPISODE_STEPS) -> int:
     """Return the number of env steps after which an episode is cut off.
+
+    Args:
+        env: The environment, which may set a limit of its own.
+        max_episode_steps: The cap; None: the env's limit.
+        unlimited: The cap where the env sets no limit.
 
     Raises:
         SpecError: The given cap is below 1.
     """
     if max_episode_steps is None:
         limit = None if env.spec is None else env.spec.max_episode_steps
-        return MAX_EPISODE_STEPS if limit is None else limit
+        return unlimited if limit is None else limit
     if max_episode_steps < 1:
         raise EnvError(f"The cap on episode steps is {max_episode_steps}.", "Use a cap of 1 or more, or none.")
     return max_episode_steps

@@ -162,7 +162,9 @@ def _picture(env: gym.Env[Any, Any]) -> str | None:
         ) from error
     if frame is None:
         return None
-    picture = enlarged(Image.fromarray(frame))
+    picture = Image.fromarray(frame)
+    # By its longer side: a narrow one would take any amount of memory.
+    picture = enlarged(picture, max(picture.size))
     picture.thumbnail((_MAX_PIXELS, _MAX_PIXELS))
     file = io.BytesIO()
     picture.save(file, "JPEG", quality=_JPEG_QUALITY)

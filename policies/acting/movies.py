@@ -26,7 +26,7 @@ _GIF_COLORS = 128
 # Pairs (scale, n): every n-th frame is kept, at this scale; tried in turn until the GIF is small enough.
 _GIF_ATTEMPTS = ((1.0, 1), (1.0, 2), (0.75, 2), (0.75, 4), (0.5, 4), (0.5, 8), (0.25, 8))
 _STILL_TIMEOUT_S = 30.0
-_MIN_WIDTH = 320
+_MIN_SIDE = 320
 
 
 class Mp4Writer:
@@ -147,9 +147,9 @@ class Mp4Writer:
             self._process.wait()
 
 
-def enlarged(picture: Image.Image) -> Image.Image:
-    """Return a picture that is wide enough to be seen, and for a caption; the pixels of a small one become squares."""
-    zoom = -(-_MIN_WIDTH // picture.width)
+def enlarged(picture: Image.Image, side: int) -> Image.Image:
+    """Return a picture whose pixels become squares if the given side of it, in pixels, is too short to be seen."""
+    zoom = -(-_MIN_SIDE // side)
     if zoom == 1:
         return picture
     return picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)

@@ -174,8 +174,7 @@ class _Stage:
         self._size: tuple[int, int] | None = None
         try:
             check_policy(policy, self._env)
-            is_endless = self._env.spec is None or self._env.spec.max_episode_steps is None
-            self._cap = episode_cap(self._env, MAX_ENDLESS_STEPS if max_steps is None and is_endless else max_steps)
+            self._cap = episode_cap(self._env, max_steps, unlimited=MAX_ENDLESS_STEPS)
             self.fps = float(self._env.metadata.get("render_fps") or _DEFAULT_FPS)
         except BaseException:
             close_env(self._env)
@@ -210,7 +209,8 @@ class _Stage:
                 f"{env_id} draws arrays of shape {np.shape(drawn)} and dtype {np.asarray(drawn).dtype}, not frames.",
                 "Mend its render(): it must return a uint8 array (height, width, 3), or floats of 0 to 1.",
             )
-        picture = enlarged(Image.fromarray(frame))
+        picture = Image.fromarray(frame)
+        picture = enlarged(picture, picture.width)  # or the caption would not fit
         # Here and not only where it is written, or the caption would be scaled with it.
         self._size = self._size or picture.size
         return fitted(picture, self._size)
@@ -249,6 +249,7 @@ class _Film:
 
 
 def _check_drawable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
+    """Check that an environment draws pictures, and let it do so in memory where there is no display."""
     draw_without_display()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -27,7 +27,7 @@ _ONE_ALONE = re.compile("(?i)(per|same|each|one|single) process")
 _PYGAME_IS_CLOSED = re.compile("display Surface quit|(?:video system|font|mixer) not initialized")
 """What pygame says once an environment of the process has called `pygame.quit()`, which closes what all draw on."""
 _OLDER_NUMPY = re.compile(
-    "module '?numpy'? has no attribute|removed in the NumPy|only 0-dimensional arrays can be converted"
+    "module 'numpy' has no attribute|removed in the NumPy|only 0-dimensional arrays can be converted"
 )
 """What NumPy says to code that was written for a version before it."""
 _PLACE = "_place_in_its_process"

@@ -84,19 +84,16 @@ def test_a_random_policy_is_filmed_as_it_is_evaluated(tmp_path: Path) -> None:
     assert filmed == evaluate_policy(policy, env_id="CartPole-v1", seeds=[8])
 
 
+def comparison_files(folder: Path) -> dict[str, Any]:
+    """Where `record_comparison` writes."""
+    names = {"left_mp4": "left.mp4", "right_mp4": "right.mp4", "right_gif": "right.gif", "both_mp4": "both.mp4"}
+    return {argument: folder / name for argument, name in names.items()}
+
+
 def test_two_episodes_are_filmed_alone_and_side_by_side(tmp_path: Path) -> None:
     left, right = balancing_policy(skill="poor"), balancing_policy()
     results = record_comparison(
-        left,
-        right,
-        env_id="CartPole-v0",
-        seed=4,
-        captions=("poor", "good"),
-        left_mp4=tmp_path / "left.mp4",
-        right_mp4=tmp_path / "right.mp4",
-        right_gif=tmp_path / "right.gif",
-        both_mp4=tmp_path / "both.mp4",
-        max_steps=80,
+        left, right, env_id="CartPole-v0", seed=4, captions=("poor", "good"), max_steps=80, **comparison_files(tmp_path)
     )
     for policy, result in zip((left, right), results, strict=True):
         assert result == evaluate_policy(policy, env_id="CartPole-v0", seeds=[4], max_episode_steps=80)
@@ -166,16 +163,9 @@ def test_two_that_share_a_display_are_filmed(tmp_path: Path, monkeypatch: pytest
         with pytest.raises(pygame.error, match="display Surface quit") as failure:
             first.reset()
         assert "env.own_process: true" in env_failed("It failed", failure.value).hint
+        left, right = (RandomPolicy.for_env("TestDisplay-v0") for _ in range(2))
         results = record_comparison(
-            RandomPolicy.for_env("TestDisplay-v0"),
-            RandomPolicy.for_env("TestDisplay-v0"),
-            env_id="TestDisplay-v0",
-            seed=1,
-            captions=("left", "right"),
-            left_mp4=tmp_path / "left.mp4",
-            right_mp4=tmp_path / "right.mp4",
-            right_gif=tmp_path / "right.gif",
-            both_mp4=tmp_path / "both.mp4",
+            left, right, env_id="TestDisplay-v0", seed=1, captions=("left", "right"), **comparison_files(tmp_path)
         )
     assert [result.returns for result in results] == [(5.0,), (5.0,)]
     assert len(read_mp4(tmp_path / "both.mp4")[1]) == 6 + 30

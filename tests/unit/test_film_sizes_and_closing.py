@@ -156,6 +156,19 @@ def test_small_pictures_are_shown_with_squares_for_pixels(monkeypatch: pytest.Mo
     assert pixels[:90].max() < 40
 
 
+@pytest.mark.parametrize(
+    ("rows", "columns", "size"), [(400, 1, (1, 400)), (20, 10, (160, 320)), (1, 100, (400, 4)), (900, 3, (2, 640))]
+)
+def test_a_narrow_picture_is_enlarged_at_play_by_its_longer_side(
+    monkeypatch: pytest.MonkeyPatch, rows: int, columns: int, size: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(Grows, "render", lambda self: np.zeros((rows, columns, 3), np.uint8))
+    _, steps = watch_episode(policy(), ENV, {}, 0)
+    with Image.open(io.BytesIO(base64.b64decode(next(steps).picture or ""))) as picture:
+        assert picture.size == size
+    steps.close()  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("number", [-0.01, 1.01, np.nan, np.inf, 1])
 def test_other_numbers_are_no_picture(number: float) -> None:
     drawn: Any = np.zeros((2, 2, 3), type(number))
