@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 PAGE_BYTES = 64
-_COUNT, _CALL, _STEPS, _RESETS = range(4)
+_COUNT, _CALL, _STEPS, _RESETS, _RENDERS = range(5)
 _Watched = TypeVar("_Watched")
 
 
@@ -48,7 +48,7 @@ _ENV_METHODS = {"reset": Call.RESET, "step": Call.STEP, "render": Call.RENDER, "
 
 
 class Page:
-    """Shared memory with the number of calls so far, the call that runs and the env's steps.
+    """Shared memory with the call that runs, and the numbers of calls, steps, resets and pictures so far.
 
     Args:
         number: Descriptor of a file of `PAGE_BYTES` bytes, which both processes have open.
@@ -78,6 +78,11 @@ class Page:
     def resets(self) -> int:
         """How often environments have been reset so far."""
         return self._cells[_RESETS]
+
+    @property
+    def renders(self) -> int:
+        """How many pictures environments have drawn so far, including one that is being drawn."""
+        return self._cells[_RENDERS]
 
     @contextlib.contextmanager
     def inside(self, call: Call) -> Iterator[None]:
@@ -116,6 +121,8 @@ class Page:
             elif call == _RESET:
                 steps[0] = 0
                 cells[_RESETS] += 1
+            elif call == _RENDER:
+                cells[_RENDERS] += 1
             try:
                 return method(*args, **kwargs)
             except BaseException:
@@ -129,7 +136,7 @@ class Page:
 
 
 # An enum's members are slow to look up.
-_STEP, _RESET = Call.STEP, Call.RESET
+_STEP, _RESET, _RENDER = Call.STEP, Call.RESET, Call.RENDER
 _page: Page | None = None
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 
 from policies.envs.rendering import display_hint
+from policies.envs.requirements import module_of_file, unmet_requirements
 from policies.errors import EnvFailedError, said_by
 
 _PACKAGE = PurePath(__file__).parents[1]
@@ -30,6 +31,17 @@ _OLDER_NUMPY = re.compile(
     "module 'numpy' has no attribute|removed in the NumPy|only 0-dimensional arrays can be converted"
 )
 """What NumPy says to code that was written for a version before it."""
+_NO_MODULE = re.compile(r"No module named '?(\w+)")
+_INSTALLED_BY = {
+    "Box2D": "Box2D==2.3.10",
+    "PIL": "pillow",
+    "cv2": "opencv-python-headless",
+    "pkg_resources": "setuptools<82",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
+}
+"""What brings a module that is called otherwise; setuptools had pkg_resources up to version 81."""
 _PLACE = "_place_in_its_process"
 _notes_signals = False
 _signalled = False
@@ -86,9 +98,27 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     detail = said_by(error)
     if (place := place_in_env(error)) is not None:
         detail += f" ({place})" if detail else f"at {place}"
-    return EnvFailedError(
-        f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", known_hint(error) or hint
-    )
+    return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint_on(error, hint))
+
+
+def hint_on(error: BaseException, otherwise: str) -> str:
+    """Return what to do about an error of an env, with the packages that the env's own package would need.
+
+    Args:
+        error: What the env raised.
+        otherwise: What to do if the error itself does not say.
+    """
+    place = place_in_env(error)
+    module = None if place is None else module_of_file(place.file)
+    return with_requirements(known_hint(error) or otherwise, module, error)
+
+
+def with_requirements(hint: str, module: str | None, error: BaseException) -> str:
+    """Return a hint on an error of a module's code, with the requirements of its package that are not met."""
+    if module is None:
+        return hint
+    unmet = unmet_requirements(module, with_missing=isinstance(error, ImportError | DependencyNotInstalled))
+    return hint if unmet is None else f"{hint} {unmet}"
 
 
 def known_hint(error: BaseException) -> str | None:
@@ -103,9 +133,19 @@ def known_hint(error: BaseException) -> str | None:
         return hint
     if _ONE_ALONE.search(said):
         return "If a process can hold one such environment only, give each a process of its own: env.own_process: true."
+    if (hint := name_hint(error)) is not None:
+        return hint
     if isinstance(error, ImportError | DependencyNotInstalled):
         return "Install the package that the message names, on every machine that runs trials."
     return numpy_hint(error)
+
+
+def name_hint(error: BaseException) -> str | None:
+    """Return how to install a module that is not there and that its package is not called as; None: it is none such."""
+    if not isinstance(error, ImportError) or (missing := _NO_MODULE.match(said_by(error))) is None:
+        return None
+    package = _INSTALLED_BY.get(missing[1])
+    return None if package is None else f'Install it, on every machine that runs trials: pip install "{package}".'
 
 
 def numpy_hint(error: BaseException) -> str | None:

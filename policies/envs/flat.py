@@ -255,8 +255,8 @@ def _written(numbers: NDArray[np.float32], part: _Part, value: Any) -> str:
     except Exception:  # noqa: BLE001 (ragged lists, say)
         array = np.empty(0, dtype=object)
     shape = part.space.shape or ()
-    # A number alone may come as an array of one.
-    if array.dtype.kind not in "biuf" or not (array.shape == shape or (shape == () and array.size == 1)):
+    # A number alone may come as an array of one, and one of those as a number alone.
+    if array.dtype.kind not in "biuf" or not (array.shape == shape or array.size == math.prod(shape) == 1):
         return f"not numbers of shape {shape}" if shape else "not a number"
     if isinstance(part.space, gym.spaces.Box):
         with np.errstate(over="ignore"):

@@ -24,7 +24,7 @@ from policies.envs import atari, calls
 from policies.envs.calls import Call
 from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
-from policies.envs.faults import close_env, is_of_env, known_hint, place_in_env
+from policies.envs.faults import close_env, hint_on, is_of_env, place_in_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
@@ -342,7 +342,7 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
     if "box2d" in detail.lower():
         # gymnasium[box2d] asks for a source build; this wheel holds the same module.
         return EnvError(message, "Install it, on every machine that runs trials: pip install Box2D==2.3.10")
-    return EnvError(message, known_hint(error) or "Check the env's arguments against its documentation.")
+    return EnvError(message, hint_on(error, "Check the env's arguments against its documentation."))
 
 
 def _check_observation_space(info: EnvInfo) -> None:

@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from policies.arguments import checked
-from policies.envs.faults import is_of_env, numpy_hint
+from policies.envs.faults import is_of_env, name_hint, numpy_hint, with_requirements
 from policies.envs.rendering import display_hint
 from policies.errors import SpecError, said_by
 
@@ -163,9 +163,11 @@ def _is_part(missing: str | None, module: str) -> bool:
 
 
 def _failed(module: str, error: BaseException) -> SpecError:
+    known = display_hint(error) or numpy_hint(error) or name_hint(error)
+    hint = known or f'Try `python -c "import {module}"`, and mend what it says.'
     return SpecError(
         f"The module {module!r} cannot be imported: {type(error).__name__}: {said_by(error)}.",
-        display_hint(error) or numpy_hint(error) or f'Try `python -c "import {module}"`, and mend what it says.',
+        with_requirements(hint, module, error),
     )
 
 

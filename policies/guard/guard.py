@@ -183,6 +183,8 @@ class EnvGuard:
         self._others: list[EnvGuard] = []
         self.episode_s: dict[str, list[float]] = {}
         """How long an episode took in a child, in seconds, by what tells environments apart; see `spread`."""
+        self.look: Callable[[], None] = lambda: None
+        """Called from time to time while a job is waited for."""
 
     def others(self, num: int) -> list[EnvGuard]:
         """Return further guards, for jobs at the same time, whose children begin; they end with this one."""
@@ -233,6 +235,11 @@ class EnvGuard:
     def num_resets(self) -> int:
         """How often the child has reset environments so far."""
         return 0 if self._child is None else self._child.page.resets
+
+    @property
+    def num_renders(self) -> int:
+        """How many pictures environments have drawn in the child so far."""
+        return 0 if self._child is None else self._child.page.renders
 
     def begin(
         self, job: str, env_id: str, *, timeout_s: float = CALL_TIMEOUT_S, look: Callable[[], None] = lambda: None,
@@ -321,6 +328,7 @@ class EnvGuard:
             except (EOFError, OSError):
                 raise _died(child, env_id) from None
             look()
+            self.look()
             # Processes that the env has started may hold the pipe open after the child's end.
             if child.process.poll() is not None and not child.connection.poll():
                 raise _died(child, env_id)

@@ -148,6 +148,19 @@ def test_a_member_of_which_no_vector_can_be_made_is_named(space: gym.Space[Any],
         check_env(env_of(space), None, "ppo")
 
 
+@pytest.mark.parametrize("shape", [(1,), (1, 1)])
+@pytest.mark.parametrize("alone", [0.5, np.float32(0.5), np.array(0.5)])
+def test_a_number_alone_is_one_of_a_single_number(shape: tuple[int, ...], alone: Any) -> None:
+    space = FlatBox(spaces.Dict({"force": spaces.Box(0, 1, shape, np.float32), "pole": NUMBERS}))
+    observation = {"force": alone, "pole": np.array([0.1, 0.2, 0.3], np.float32)}
+    np.testing.assert_array_equal(space.flat(observation), np.array([0.5, 0.1, 0.2, 0.3], np.float32))
+
+
+def test_a_number_alone_is_not_several() -> None:
+    with pytest.raises(ValueError, match=r"0.5 as observation\['pole'\], not numbers of shape \(3,\)"):
+        FlatBox(spaces.Dict({"pole": NUMBERS})).flat({"pole": 0.5})
+
+
 @pytest.mark.parametrize(
     ("kind", "observation", "words"),
     [

@@ -92,7 +92,7 @@ class _Finish:
         if page is not None:
             self.artifacts["report"] = page
         else:
-            self._attempt("report", "writing the report", lambda: {"report": finish.make_report(store, self._why)})
+            self._attempt("report", "writing the report", lambda _: {"report": finish.make_report(store, self._why)})
 
     def _films_and_report(self, best: BestRecord) -> None:
         """Film the winner, and draw the report meanwhile."""
@@ -102,24 +102,30 @@ class _Finish:
             return
         with DrawnReport(self._store, best) as report:
             self._film()
-            self._attempt("report", "writing the report", lambda: {"report": report.written()})
+            self._attempt("report", "writing the report", lambda _: {"report": report.written()})
 
     def _film(self) -> None:
         from tune_jobs.sweeps import conclude as finish
+        from tune_jobs.sweeps.filming import telling_frames
 
-        self._attempt("video", "filming the best policy", lambda: finish.make_videos(self._store))
+        def films(say: Callable[[str], None]) -> dict[str, Path]:
+            with telling_frames(say, doing):
+                return finish.make_videos(self._store)
+
+        doing = "filming the best policy"
+        self._attempt("video", doing, films)
 
     def _working(self, doing: str) -> AbstractContextManager[Callable[[str], None]]:
         from tune_jobs.sweeps.live_view import working
 
         return working(self._store.name, doing, self._progress)
 
-    def _attempt(self, what: str, doing: str, make: Callable[[], dict[str, Path]]) -> None:
+    def _attempt(self, what: str, doing: str, make: Callable[[Callable[[str], None]], dict[str, Path]]) -> None:
         if self._asked_to_stop():
             return
         try:
-            with self._working(doing):
-                self.artifacts.update(make())
+            with self._working(doing) as say:
+                self.artifacts.update(make(say))
         except TuneJobsError as error:
             self.notes.append(f"No {what}: {error}")
             # Other errors are expected, as not every environment can be drawn.

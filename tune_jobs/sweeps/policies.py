@@ -122,16 +122,17 @@ def video(
         EnvError: The environment cannot be drawn.
     """
     from tune_jobs.sweeps import conclude as finish
+    from tune_jobs.sweeps.filming import telling_frames
     from tune_jobs.sweeps.live_view import working
 
     with working(str(source), "reading the policy", progress) as say:
         found = finish.find_policy(source, storage, env_id, action, say)
-        say("filming")
-        if output is None and found.store is not None:
-            return Films(finish.make_videos(found.store, seed))
-        name = str(source).replace("/", "-").lstrip(".-") or "policy"
-        target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
-        return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
+        with telling_frames(say, "filming"):
+            if output is None and found.store is not None:
+                return Films(finish.make_videos(found.store, seed))
+            name = str(source).replace("/", "-").lstrip(".-") or "policy"
+            target = _film_path(output, f"{name}-{re.sub('[/:]', '-', found.env_id)}.mp4")
+            return Films(finish.make_video(found, target, finish.FRESH_SEED if seed is None else seed))
 
 
 def _film_path(output: str | Path | None, name: str) -> Path:
