@@ -21,7 +21,7 @@ from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
-from tune_jobs.sweeps.monitor import SweepMonitor
+from tune_jobs.sweeps.monitor import SweepMonitor, reached_of
 from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
 
 _POLL_S = 0.5
@@ -91,7 +91,7 @@ class _Look:
         self._stamps: Mapping[str, object] = store.trial_stamps()
         record = store.read_record()
         trials = readable_trials(store)
-        self.monitor = _Monitor(store.name, trials, caps=_caps(record, trials))
+        self.monitor = _Monitor(store.name, trials, caps=_caps(record, trials), reached=reached_of(store))
         # When a run began that goes on with an earlier one is not recorded.
         self.monitor.began_at = record.started_at if store.is_driven() and not record.run_time_s else None
         self.job: Job | None = None

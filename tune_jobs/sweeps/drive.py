@@ -32,7 +32,7 @@ from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.forecast import caps_of
-from tune_jobs.sweeps.monitor import SweepMonitor
+from tune_jobs.sweeps.monitor import SweepMonitor, reached_of
 from tune_jobs.sweeps.outcome import SweepResult
 
 if TYPE_CHECKING:
@@ -256,7 +256,7 @@ def run_trials_of(
         spec, trials = stored_spec(record), store.read_trials()
         caps = caps_of(spec, trials)
         if shared.monitor is None:
-            shared.monitor = SweepMonitor(store.name, trials, caps=caps)
+            shared.monitor = SweepMonitor(store.name, trials, caps=caps, reached=reached_of(store))
         else:
             shared.monitor.begin_stage(told, trials, caps)
         try:

@@ -56,6 +56,7 @@ def render(monitor: SweepMonitor, width: int = 120, height: int | None = None) -
         width: Characters of a line; of trials, as many columns are shown as fit.
         height: Lines of the terminal; None: any number.
     """
+    monitor.look()
     parts: list[RenderableType] = [_head(monitor, width), _facts(monitor)]
     most = _MAX_ROWS if height is None else max(1, min(_MAX_ROWS, height - _ROOM_FOR_OTHERS))
     rows, left_out = monitor.rows(most)
@@ -183,6 +184,7 @@ def _cells(row: Row, names: Sequence[str]) -> list[str]:
 
 def summary_line(monitor: SweepMonitor) -> str:
     """Describe the state of a sweep in one short line, for logs."""
+    monitor.look()
     elapsed = f"{monitor.title}: {duration(monitor.elapsed_s, tenths=False)}"
     if monitor.phase:
         return f"{elapsed}; {monitor.phase}"

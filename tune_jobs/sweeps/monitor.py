@@ -9,11 +9,16 @@ from dataclasses import dataclass
 
 from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, Selection, select_best
+from policies.envs.tallies import Reached, read_tally
+from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.forecast import Forecast, forecast
 
 _RATE_WINDOW_S = 20.0
 _IDLE_S = 10.0
 """How long no trial runs until that is worth a word; from one trial to the next takes less."""
+_SILENCE_S = 5.0
+"""How long no trial reports until it is looked for how far they are within an iteration."""
+_LOOK_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,7 @@ class SweepMonitor:
         name: The sweep's name.
         records: Its trials at the start.
         caps: The env steps after which each trial ends at the latest, by its id.
+        reached: Returns how far a running trial is at this moment, by its id; None: it is not known.
         clock: A monotonic clock, in seconds.
     """
 
@@ -42,6 +48,7 @@ class SweepMonitor:
         records: Iterable[TrialRecord],
         *,
         caps: Mapping[str, int],
+        reached: Callable[[str], Reached | None] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = name
@@ -54,7 +61,10 @@ class SweepMonitor:
         """When a trial last reported env steps, Unix time in seconds; None: none has."""
         self._caps = caps
         self._clock = clock
-        self._start = clock()
+        self._start = self._looked_at = self._heard_at = clock()
+        self._reached = reached
+        self._within: dict[str, Reached] = {}
+        """How far trials are that have not told it yet, by their ids."""
         # When the last trial that ran ended or was lost.
         self._idle_since = self._start
         self._num_env_steps = sum(record.num_env_steps for record in self.records.values())
@@ -104,7 +114,23 @@ class SweepMonitor:
 
     def progress(self) -> Forecast:
         """Return how far the trials are, in env steps, and how long the others take: what `status` tells, too."""
-        return forecast(list(self.records.values()), self._caps)
+        return forecast([self._as_reached(record) for record in list(self.records.values())], self._caps)
+
+    def look(self) -> None:
+        """Look how far the trials are if none has reported for a while: an iteration of a slow env takes minutes."""
+        now = self._clock()
+        if now - self._heard_at < _SILENCE_S or now - self._looked_at < _LOOK_S:
+            return
+        self._looked_at = now
+        running = [name for name, record in list(self.records.items()) if record.status == "running"]
+        self._within = {name: reached for name in running if (reached := self._reached(name)) is not None}
+
+    def _as_reached(self, record: TrialRecord) -> TrialRecord:
+        """Return a trial's record with what the trial has reached since it was written."""
+        reached = self._within.get(record.trial_id)
+        if reached is None or record.status != "running" or reached.num_env_steps <= record.num_env_steps:
+            return record
+        return record.model_copy(update={"num_env_steps": reached.num_env_steps, "time_s": reached.time_s})
 
     def update(self, record: TrialRecord) -> None:
         """Take the new state of a trial."""
@@ -117,7 +143,7 @@ class SweepMonitor:
             self._idle_since = self._clock()
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
         self.records[record.trial_id] = record
-        now = self._clock()
+        self._heard_at = now = self._clock()
         if self._num_env_steps == self._history[0][1]:
             # Nothing was sampled here before: the time to start Ray and the processes must not count for the rate.
             self._history.clear()
@@ -155,7 +181,7 @@ class SweepMonitor:
         ranked = [] if best is None else self._ranked(best)
         known = {row.trial.trial_id for row in ranked}
         new = [
-            Row(None, None, record)
+            Row(None, None, self._as_reached(record))
             for record in list(self.records.values())
             if record.status == "running" and record.trial_id not in known
         ]
@@ -169,7 +195,7 @@ class SweepMonitor:
     def _ranked(self, best: Selection) -> list[Row]:
         return [
             # The selection may be older than the newest report of its trials.
-            Row(rank, scored.score, self.records[scored.trial.trial_id])
+            Row(rank, scored.score, self._as_reached(self.records[scored.trial.trial_id]))
             for rank, point in enumerate(best.ranking, start=1)
             for scored in point.trial_scores
         ]
@@ -179,3 +205,8 @@ class SweepMonitor:
         first_time, first_steps = self._history[0]
         span = self._clock() - first_time
         return (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
+
+
+def reached_of(store: Sweep) -> Callable[[str], Reached | None]:
+    """Return what reads how far a running trial of a sweep is, by its id; None: its process is on another machine."""
+    return lambda trial_id: read_tally(store.trial(trial_id).tally_path)
