@@ -72,8 +72,11 @@ def test_a_report_takes_the_place_of_what_was_looked_up(within: Within) -> None:
     assert "250 env steps" in summary_line(within.monitor)
     within.monitor.update(make_trial(0, steps=300, time_s=60.0))
     assert "300 env steps" in summary_line(within.monitor)
-    # A retry goes on from an earlier checkpoint, and its process begins where that was.
-    within.monitor.update(make_trial(0, "pending", steps=100, time_s=20.0))
+    # A retry goes on from an earlier checkpoint.
+    within.comes_to(350, 70.0)
+    within.clock.now += 6
+    assert "350 env steps" in summary_line(within.monitor)
+    within.monitor.update(make_trial(0, steps=100, time_s=20.0))
     assert "100 env steps" in summary_line(within.monitor)
 
 

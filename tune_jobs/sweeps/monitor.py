@@ -114,7 +114,9 @@ class SweepMonitor:
 
     def progress(self) -> Forecast:
         """Return how far the trials are, in env steps, and how long the others take: what `status` tells, too."""
-        return forecast([self._as_reached(record) for record in list(self.records.values())], self._caps)
+        records = list(self.records.values())
+        # Of ten thousand trials that report, a look at each would be for nothing.
+        return forecast([self._as_reached(record) for record in records] if self._within else records, self._caps)
 
     def look(self) -> None:
         """Look how far the trials are if none has reported for a while: an iteration of a slow env takes minutes."""
@@ -141,6 +143,9 @@ class SweepMonitor:
             self.reported_at = time.time()
         if before is not None and before.status == "running":
             self._idle_since = self._clock()
+        if before is None or record.num_env_steps < before.num_env_steps:
+            # It goes on from an earlier checkpoint.
+            self._within.pop(record.trial_id, None)
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
         self.records[record.trial_id] = record
         self._heard_at = now = self._clock()
