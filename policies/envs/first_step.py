@@ -20,6 +20,7 @@ from policies.envs.faults import env_failed
 from policies.envs.flat import FlatBox, needs_flattening
 from policies.envs.mask_hints import mask_hint
 from policies.envs.masks import ACTION_MASK, NoMaskError, num_masked, sample, seen_by_networks
+from policies.envs.own_actions import is_made
 from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
@@ -52,9 +53,11 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
     space = copy.deepcopy(env.action_space)  # the env may draw from its own
     space.seed(0)
     action = sample(env, space, observation)
+    # As the env itself gets it, so that its author can repeat the call.
+    own = space.own(action) if is_made(space) else action
     _check_call(
         env, "step", lambda: env.step(action),
-        find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {action!r} after a reset",
+        find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {own!r} after a reset",
         hint=_STEP_HINT,
     )  # fmt: skip
     return dict(infos)

@@ -234,3 +234,25 @@ def test_a_network_of_other_outputs_is_refused(tmp_path: Path) -> None:
     space = describe_space(made_of(spaces.MultiBinary(2)))
     with pytest.raises(CheckpointError, match="has 3 outputs, but its actions need 4"):
         save_policy(dataclasses.replace(portable, action_space=space), tmp_path)
+
+
+class Refuses(gym.Env[Any, Any]):
+    """Takes none of its own actions."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Dict({"force": spaces.Box(-9, 9, (1,), np.float32)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        raise ValueError("no array is taken")
+
+
+def test_a_first_step_that_fails_is_told_with_the_action_as_the_env_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gym.registry, "Refuses-v0", None)
+    del gym.registry["Refuses-v0"]
+    gym.register("Refuses-v0", cast("Any", Refuses))
+    with pytest.raises(EnvError, match=r"with the action \{'force': array\(\[[-.\d]+\].*\)\} after a reset: Value"):
+        check_env("Refuses-v0", None, "ppo")
