@@ -11,14 +11,15 @@ import contextlib
 import mmap
 import struct
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from policies.files import read_regular
 
-_FORMAT = "=4d"
+_FORMAT = "=5d"
 _SIZE = struct.calcsize(_FORMAT)
-_ITERATIONS, _STEPS, _EPISODES, _TIME = range(4)
+_ITERATIONS, _STEPS, _EPISODES, _TIME, _EVALUATES = range(5)
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Reached:
     num_env_steps: int
     num_episodes: int
     time_s: float
+    evaluates: bool = False
+    """Whether it plays the episodes of an evaluation at this moment, which are not counted."""
 
 
 class Tally:
@@ -66,6 +69,10 @@ class Tally:
         cells[_ITERATIONS], cells[_STEPS] = reached.num_iterations, reached.num_env_steps
         cells[_EPISODES], cells[_TIME] = reached.num_episodes, reached.time_s
 
+    def set_evaluates(self, *, evaluates: bool) -> None:
+        """Set whether the trial plays an evaluation."""
+        self._cells[_EVALUATES] = evaluates
+
     @property
     def reached(self) -> Reached:
         """How far the trial is now."""
@@ -85,8 +92,8 @@ def read_tally(path: Path) -> Reached | None:
         return None
 
 
-def _reached(iterations: float, steps: float, episodes: float, time_s: float) -> Reached:
-    return Reached(int(iterations), int(steps), int(episodes), time_s)
+def _reached(iterations: float, steps: float, episodes: float, time_s: float, evaluates: float) -> Reached:
+    return Reached(int(iterations), int(steps), int(episodes), time_s, bool(evaluates))
 
 
 _tallies: dict[str, Tally] = {}
@@ -111,3 +118,16 @@ def tally_of(trial_id: str) -> Tally | None:
 def only_tally() -> Tally | None:
     """Return the tally of the only trial that this process trains; None if there are none or several."""
     return next(iter(_tallies.values())) if len(_tallies) == 1 else None
+
+
+@contextlib.contextmanager
+def evaluating(trial_ids: Iterable[str]) -> Iterator[None]:
+    """Let the tallies of some trials say that they are evaluated while the block runs."""
+    tallies = [tally for trial_id in trial_ids if (tally := tally_of(trial_id)) is not None]
+    for tally in tallies:
+        tally.set_evaluates(evaluates=True)
+    try:
+        yield
+    finally:
+        for tally in tallies:
+            tally.set_evaluates(evaluates=False)

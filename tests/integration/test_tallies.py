@@ -164,3 +164,49 @@ def test_the_record_of_a_failed_trial_says_how_far_it_was(
     keeper.progressed("t0004", progress(4), node="here", pid=12)
     keeper.failed("t0004", "its node is gone", retried=False)
     assert (keeper.record("t0004").num_iterations, keeper.record("t0004").num_env_steps) == (4, 400)
+
+
+def test_a_trial_says_while_it_is_evaluated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Trial(tmp_path, evaluation={"every_iterations": 2})
+    path = trial.store.tally_path
+    said = []
+
+    def told(around: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any) -> Any:
+            said.append(present(read_tally(path)).evaluates)
+            return around(*args)
+
+        return run
+
+    monkeypatch.setattr(trial.loop._evaluator, "run", told(trial.loop._evaluator.run))
+    monkeypatch.setattr(trial.engine, "train_iteration", told(trial.engine.train_iteration))
+    trial.run_to(4)
+    assert said == [False, False, True, False, False, True]
+    assert not present(read_tally(path)).evaluates
+
+
+def test_of_a_pack_those_that_are_due_say_it(tmp_path: Path) -> None:
+    pack = Pack(tmp_path, evaluation={"every_iterations": 1})
+    said = []
+
+    def evaluate(evaluator: Any, policies: Any) -> Any:
+        said.append([present(tally_of(name)).reached.evaluates for name in ("t0000", "t0001")])
+        raise ZeroDivisionError
+
+    pack.loop._evaluate = evaluate
+    pack.add("t0000", "t0001")
+    with pytest.raises(ZeroDivisionError):
+        pack.run()
+    assert said == [[True, True]]
+    assert not any(present(tally_of(name)).reached.evaluates for name in ("t0000", "t0001"))
+
+
+def test_numbers_that_are_none_are_no_tally(tmp_path: Path) -> None:
+    path = tmp_path / ".tally"
+    path.write_bytes(np.array([1.0, 200, 3, 7, 1]).tobytes())
+    assert read_tally(path) == Reached(1, 200, 3, 7.0, evaluates=True)
+    for place in range(3):
+        cells = np.ones(5)
+        cells[place] = np.nan
+        path.write_bytes(cells.tobytes())
+        assert read_tally(path) is None

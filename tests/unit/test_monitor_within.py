@@ -126,3 +126,27 @@ def test_it_is_read_from_what_the_trial_s_process_writes(tmp_path: Path) -> None
     found = read("t0000")
     assert found is not None
     assert (found.num_iterations, found.num_env_steps, found.num_episodes) == (2, 130, 5)
+
+
+def test_who_evaluates_is_told_until_it_reports(within: Within) -> None:
+    within.reached["t0000"] = Reached(1, 500, 4, 50.0, evaluates=True)
+    assert "1 pending, 1 running" in summary_line(within.monitor)
+    within.clock.now += 6
+    assert "1 pending, 1 running (1 evaluating)" in summary_line(within.monitor)
+    assert "1 running (1 evaluating)  1 pending" in within.lines()[1]
+    within.monitor.update(make_trial(0, steps=500, time_s=50.0))
+    assert "evaluating" not in summary_line(within.monitor)
+    within.reached["t0000"] = Reached(2, 700, 4, 50.0)
+    within.clock.now += 6
+    assert "700 env steps" in summary_line(within.monitor)
+    assert "evaluating" not in summary_line(within.monitor)
+
+
+def test_a_trial_that_failed_evaluates_no_more(within: Within) -> None:
+    within.reached["t0000"] = Reached(1, 500, 4, 50.0, evaluates=True)
+    within.clock.now += 6
+    assert "evaluating" in summary_line(within.monitor)
+    within.monitor.update(make_trial(1))
+    within.monitor.update(make_trial(0, "failed", steps=400))
+    assert "1 failed, 1 running" in summary_line(within.monitor)
+    assert "evaluating" not in summary_line(within.monitor)

@@ -90,7 +90,9 @@ def _facts(monitor: SweepMonitor) -> RenderableType:
     grid = Table.grid(padding=(0, 2))
     counts = monitor.counts()
     ended = sum(count for status, count in counts.items() if status in FINISHED)
-    grid.add_row("trials", Text(f"{ended:,} of {len(monitor.records):,} ended   ").append_text(_status_line(counts)))
+    grid.add_row(
+        "trials", Text(f"{ended:,} of {len(monitor.records):,} ended   ").append_text(_status_line(monitor, counts))
+    )
     steps = f"{progress.num_env_steps:,}"
     if progress.num_env_steps < progress.max_env_steps:
         steps += f" of at most {progress.max_env_steps:,}"
@@ -117,9 +119,15 @@ def _time_left(monitor: SweepMonitor) -> str:
     return f"   left: about {duration(seconds, tenths=False, none=PLAIN_NONE)}"
 
 
-def _status_line(counts: dict[TrialStatus, int]) -> Text:
+def _told(monitor: SweepMonitor, status: TrialStatus, count: str) -> str:
+    """Return how many trials have a status, as words: "2 running (1 evaluating)"."""
+    evaluating = monitor.num_evaluating if status == "running" else 0
+    return f"{count} {status}{f' ({evaluating:,} evaluating)' if evaluating else ''}"
+
+
+def _status_line(monitor: SweepMonitor, counts: dict[TrialStatus, int]) -> Text:
     words = [
-        Text(f"{counts[status]:,} {status}", style=style)
+        Text(_told(monitor, status, f"{counts[status]:,}"), style=style)
         for status, style in STATUS_STYLES.items()
         if counts.get(status)
     ]
@@ -193,7 +201,7 @@ def summary_line(monitor: SweepMonitor) -> str:
     words = [
         elapsed,
         f"{share} %, {counted(progress.num_env_steps, 'env step')}",
-        ", ".join(f"{count} {status}" for status, count in sorted(monitor.counts().items())),
+        ", ".join(_told(monitor, status, str(count)) for status, count in sorted(monitor.counts().items())),
     ]
     if monitor.waits:
         words.append(_WAITS)

@@ -143,8 +143,13 @@ class SweepMonitor:
             self.reported_at = time.time()
         if before is not None and before.status == "running":
             self._idle_since = self._clock()
-        if before is None or record.num_env_steps < before.num_env_steps:
+        looked_up = self._within.get(record.trial_id)
+        if looked_up is not None and (
+            looked_up.num_env_steps <= record.num_env_steps
             # It goes on from an earlier checkpoint.
+            or (before is not None and record.num_env_steps < before.num_env_steps)
+        ):
+            # Whoever draws may have looked again meanwhile.
             self._within.pop(record.trial_id, None)
         self._num_env_steps += record.num_env_steps - (before.num_env_steps if before else 0)
         self.records[record.trial_id] = record
@@ -162,6 +167,12 @@ class SweepMonitor:
     def counts(self) -> dict[TrialStatus, int]:
         """Return the number of trials by status."""
         return dict(Counter(record.status for record in self.records.values()))
+
+    @property
+    def num_evaluating(self) -> int:
+        """How many of the running trials play an evaluation, as far as was looked for."""
+        within = list(self._within.items())
+        return sum(each.evaluates and self.records[name].status == "running" for name, each in within)
 
     def best(self) -> Selection | None:
         """Return the winner so far, by the rule that will choose the winner; None while no trial is usable."""

@@ -19,7 +19,7 @@ from typing import Any
 
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import Policy
-from policies.envs.tallies import Reached, tally_of
+from policies.envs.tallies import Reached, evaluating, tally_of
 from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.opening import open_sweep
@@ -222,7 +222,8 @@ class PackLoop:
                     evaluations[member] = None
             if due:
                 policies = [member.trial.policy() for member in due]
-                evaluations.update(zip(due, self._evaluate(self._evaluator, policies), strict=True))
+                with evaluating(member.task.trial_id for member in due):
+                    evaluations.update(zip(due, self._evaluate(self._evaluator, policies), strict=True))
             self._conclude(evaluations)
         return bool(due)
 

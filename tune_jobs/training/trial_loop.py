@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 from policies.acting.evaluate import Episodes, Evaluator
+from policies.envs.tallies import evaluating
 from policies.errors import NonFiniteWeightsError
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.progress import Progress
@@ -55,7 +56,8 @@ class TrialLoop(TrialSteps):
         evaluation: Episodes | NonFiniteWeightsError | None = None
         try:
             if self.take(self._trains.train_iteration()):
-                evaluation = self._evaluator.run(self.policy())
+                with evaluating([self.task.trial_id]):
+                    evaluation = self._evaluator.run(self.policy())
         except NonFiniteWeightsError as error:
             evaluation = error
         return self.conclude(evaluation)
