@@ -255,6 +255,22 @@ def test_evaluations_are_told_beside_random_ones(run: RunCommand, sweeps: FakeSw
     assert "no threshold" in run("evaluate", "p").stdout
 
 
+@pytest.mark.parametrize(
+    ("returns", "ends"),
+    [
+        ((-45.6321, 793.069), "-45.6 to 793.1"),
+        ((-1.0, 0.5), "-1.000 to 0.500"),
+        ((0.0123, 0.25), "0.012 to 0.250"),
+        ((-3.0, 2_571_264.0), "-3 to 2571264"),
+    ],
+)
+def test_the_least_and_the_largest_return_are_rounded_as_the_mean_is(
+    run: RunCommand, sweeps: FakeSweeps, returns: tuple[float, float], ends: str
+) -> None:
+    sweeps.answers["evaluate"] = (evaluation("p", *returns), evaluation("random", 20.0))
+    assert f"over 2 episodes ({ends})" in run("evaluate", "p").stdout
+
+
 # -- errors
 
 

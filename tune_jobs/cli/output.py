@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from analysis.wording import PLAIN_NONE, counted, difference_text, return_text, setting_text
+from analysis.wording import PLAIN_NONE, counted, difference_text, range_text, return_text, setting_text
 from tune_jobs.process.interruption import last_words
 from tune_jobs.sweeps.plain import to_json
 
@@ -272,7 +272,10 @@ def _returns(record: EvaluationRecord) -> str:
     low, high = min(record.returns), max(record.returns)
     mean, deviation = record.mean_return, record.std_return
     spread = f"{return_text(mean, deviation)} ± {return_text(deviation, mean)}"
-    return f"{spread} over {counted(record.num_episodes, 'episode')} ({low:g} to {high:g})"
+    # Rewards of whole numbers give returns that are some, which need no decimals.
+    whole = float(low).is_integer() and float(high).is_integer()
+    ends = f"{low:.0f} to {high:.0f}" if whole else range_text(low, high)
+    return f"{spread} over {counted(record.num_episodes, 'episode')} ({ends})"
 
 
 def _verdict(record: EvaluationRecord) -> dict[str, str]:
