@@ -10,7 +10,8 @@ from analysis.records import TrialRecord
 from policies.envs.tallies import Reached, Tally
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.live_table import render, summary_line
-from tune_jobs.sweeps.monitor import SweepMonitor, reached_of
+from tune_jobs.sweeps.monitor import SweepMonitor
+from tune_jobs.sweeps.reached import reached_of, up_to_now
 
 
 def make_trial(index: int, status: str = "running", steps: int = 0, time_s: float = 0.0) -> TrialRecord:
@@ -150,3 +151,18 @@ def test_a_trial_that_failed_evaluates_no_more(within: Within) -> None:
     within.monitor.update(make_trial(0, "failed", steps=400))
     assert "1 failed, 1 running" in summary_line(within.monitor)
     assert "evaluating" not in summary_line(within.monitor)
+
+
+def test_a_status_has_what_is_trained_by_now_while_a_process_drives_the_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = SweepStore(tmp_path / "mine")
+    trials = [make_trial(0, steps=100), make_trial(1, "paused", steps=100), make_trial(2, steps=100)]
+    for trial in trials[:2]:
+        path = store.trial(trial.trial_id).tally_path
+        path.parent.mkdir(parents=True)
+        Tally(path, Reached(2, 130, 4, 20.0))
+    assert list(up_to_now(store, trials)) == trials
+    monkeypatch.setattr(SweepStore, "is_driven", lambda _: True)
+    now = up_to_now(store, trials)
+    assert [(trial.num_env_steps, trial.time_s) for trial in now] == [(130, 20.0), (100, 0.0), (100, 0.0)]

@@ -21,8 +21,9 @@ from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
-from tune_jobs.sweeps.monitor import SweepMonitor, reached_of
+from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
+from tune_jobs.sweeps.reached import reached_of
 
 _POLL_S = 0.5
 _ASK_EVERY_S = 5.0

@@ -32,8 +32,9 @@ from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.forecast import caps_of
-from tune_jobs.sweeps.monitor import SweepMonitor, reached_of
+from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.reached import reached_of
 
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection

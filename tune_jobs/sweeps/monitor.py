@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import NoUsableTrialError, Selection, select_best
-from policies.envs.tallies import Reached, read_tally
-from tune_jobs.store.contract import Sweep
+from policies.envs.tallies import Reached
 from tune_jobs.sweeps.forecast import Forecast, forecast
+from tune_jobs.sweeps.reached import as_reached
 
 _RATE_WINDOW_S = 20.0
 _IDLE_S = 10.0
@@ -129,10 +129,7 @@ class SweepMonitor:
 
     def _as_reached(self, record: TrialRecord) -> TrialRecord:
         """Return a trial's record with what the trial has reached since it was written."""
-        reached = self._within.get(record.trial_id)
-        if reached is None or record.status != "running" or reached.num_env_steps <= record.num_env_steps:
-            return record
-        return record.model_copy(update={"num_env_steps": reached.num_env_steps, "time_s": reached.time_s})
+        return as_reached(record, self._within.get(record.trial_id))
 
     def update(self, record: TrialRecord) -> None:
         """Take the new state of a trial."""
@@ -221,8 +218,3 @@ class SweepMonitor:
         first_time, first_steps = self._history[0]
         span = self._clock() - first_time
         return (self._num_env_steps - first_steps) / span if span > 0 and self._num_env_steps > first_steps else None
-
-
-def reached_of(store: Sweep) -> Callable[[str], Reached | None]:
-    """Return what reads how far a running trial of a sweep is, by its id; None: its process is on another machine."""
-    return lambda trial_id: read_tally(store.trial(trial_id).tally_path)

@@ -216,9 +216,10 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
 
 def _status(store: Sweep) -> SweepStatus:
     from tune_jobs.store.candidates import readable_trials
+    from tune_jobs.sweeps.reached import up_to_now
 
     record = store.read_record()
-    return replace(status_of(store, record, readable_trials(store)), place=store.place)
+    return replace(status_of(store, record, up_to_now(store, readable_trials(store))), place=store.place)
 
 
 def status_of(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> SweepStatus:

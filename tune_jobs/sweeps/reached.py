@@ -1,0 +1,35 @@
+"""Find out how far trials are within an iteration, whose records are written at its end alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from analysis.records import TrialRecord
+from policies.envs.tallies import Reached, read_tally
+from tune_jobs.store.contract import Sweep
+
+
+def reached_of(store: Sweep) -> Callable[[str], Reached | None]:
+    """Return what reads how far a running trial of a sweep is, by its id; None: its process is on another machine."""
+    return lambda trial_id: read_tally(store.trial(trial_id).tally_path)
+
+
+def as_reached(record: TrialRecord, reached: Reached | None) -> TrialRecord:
+    """Return a trial's record with what the trial has trained since it was written.
+
+    Args:
+        record: The record.
+        reached: How far the trial is; None: it is not known.
+    """
+    if reached is None or record.status != "running" or reached.num_env_steps <= record.num_env_steps:
+        return record
+    return record.model_copy(update={"num_env_steps": reached.num_env_steps, "time_s": reached.time_s})
+
+
+def up_to_now(store: Sweep, trials: Sequence[TrialRecord]) -> Sequence[TrialRecord]:
+    """Return the trials of a sweep with what those that run on this machine have trained by now."""
+    # What a process that was killed had trained since is lost.
+    if all(trial.status != "running" for trial in trials) or not store.is_driven():
+        return trials
+    read = reached_of(store)
+    return [as_reached(trial, read(trial.trial_id) if trial.status == "running" else None) for trial in trials]
