@@ -26,13 +26,16 @@ def unmet_requirements(module: str, *, with_missing: bool = False) -> str | None
         with_missing: Whether what is not installed at all is named, too. Much of that is never imported.
     """
     top = module.partition(".")[0]
-    unmet = _unmet(top)
+    try:
+        unmet, asks = _unmet(top), _distribution_of(top)
+    except Exception:  # noqa: BLE001 (damaged metadata, of whichever package: the error to be told is another one)
+        return None
     said = [f"{asked}, where {found} is installed" for asked, found in unmet.items() if found is not None]
     if with_missing:
         said += [f"{asked}, which is not installed" for asked, found in unmet.items() if found is None]
     if not said:
         return None
-    return f"{_distribution_of(top)} asks for {'; '.join(said[:_MOST])}: that may be why."
+    return f"{asks} asks for {'; '.join(said[:_MOST])}: that may be why."
 
 
 def module_of_file(file: str) -> str | None:

@@ -83,6 +83,28 @@ def test_what_is_met_or_not_asked_for_here_is_not_named(install: Install, requir
     assert hint_on(install(requires)) == MEND
 
 
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        b"",
+        b"Metadata-Version: 2.1\nName: {name}\nRequires-Dist: numpy<1.0\n",
+        b"Metadata-Version: 2.1\nName: {name}\nVersion: 2.1\nRequires-Dist: {name}>=3\n",
+        b"Metadata-Version: 2.1\nVersion: 2.1\nRequires-Dist: numpy<1.0\n",
+        b"Metadata-Version: 2.1\nName: {name}\nVersion: new\nRequires-Dist: {name}>=3\n",
+        b"Name: {name}\nVersion: 2.1\nRequires-Dist: \xff\xfe<1\n",
+    ],
+    ids=str,
+)
+def test_whatever_the_metadata_is_the_env_s_own_error_is_told(
+    install: Install, tmp_path: Path, metadata: bytes
+) -> None:
+    name = install([])
+    (tmp_path / f"{name}-2.1.dist-info" / "METADATA").write_bytes(metadata.replace(b"{name}", name.encode()))
+    with pytest.raises(EnvError, match="an arm too many") as failure:
+        check_env(f"{name}:Robot", None)
+    assert failure.value.hint.startswith(MEND)
+
+
 def test_what_was_installed_by_nothing_known_asks_for_nothing() -> None:
     assert unmet_requirements("no_such_module_at_all") is None
     assert module_of_file("/no/such/place/robots/arm.py") is None
