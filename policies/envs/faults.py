@@ -42,6 +42,8 @@ _INSTALLED_BY = {
     "yaml": "pyyaml",
 }
 """What brings a module that is called otherwise; setuptools had pkg_resources up to version 81."""
+_RESET_TAKES_LESS = re.compile(r"\breset\(\) got an unexpected keyword argument '(?:seed|options)'")
+"""What Python says where an env has the `reset` of an older Gym, or a part of Gymnasium's."""
 _PLACE = "_place_in_its_process"
 _notes_signals = False
 _signalled = False
@@ -131,6 +133,11 @@ def known_hint(error: BaseException) -> str | None:
         )
     if (hint := display_hint(error)) is not None:
         return hint
+    if isinstance(error, TypeError) and _RESET_TAKES_LESS.search(said):
+        return (
+            "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or "
+            "wrap it in a class of your own that calls it without."
+        )
     if _ONE_ALONE.search(said):
         return "If a process can hold one such environment only, give each a process of its own: env.own_process: true."
     if (hint := name_hint(error)) is not None:
