@@ -44,6 +44,21 @@ _INSTALLED_BY = {
 """What brings a module that is called otherwise; setuptools had pkg_resources up to version 81."""
 _RESET_TAKES_LESS = re.compile(r"\breset\(\) got an unexpected keyword argument '(?:seed|options)'")
 """What Python says where an env has the `reset` of an older Gym, or a part of Gymnasium's."""
+_BY_WORDS = (
+    (
+        Exception,
+        _PYGAME_IS_CLOSED,
+        "pygame has one display for all environments of a process: if another one has closed it, give each a process "
+        "of its own: env.own_process: true.",
+    ),
+    (
+        TypeError,
+        _RESET_TAKES_LESS,
+        "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or wrap "
+        "it in a class of your own that calls it without.",
+    ),
+)
+"""What to do about errors of some class with some words."""
 _PLACE = "_place_in_its_process"
 _notes_signals = False
 _signalled = False
@@ -126,18 +141,9 @@ def with_requirements(hint: str, module: str | None, error: BaseException) -> st
 def known_hint(error: BaseException) -> str | None:
     """Return what to do about an error of an env that lacks a package, a display or room; None: another one."""
     said = said_by(error)
-    if _PYGAME_IS_CLOSED.search(said):
-        return (
-            "pygame has one display for all environments of a process: if another one has closed it, give each a "
-            "process of its own: env.own_process: true."
-        )
-    if (hint := display_hint(error)) is not None:
+    known = next((hint for kind, words, hint in _BY_WORDS if isinstance(error, kind) and words.search(said)), None)
+    if (hint := known or display_hint(error)) is not None:
         return hint
-    if isinstance(error, TypeError) and _RESET_TAKES_LESS.search(said):
-        return (
-            "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or "
-            "wrap it in a class of your own that calls it without."
-        )
     if _ONE_ALONE.search(said):
         return "If a process can hold one such environment only, give each a process of its own: env.own_process: true."
     if (hint := name_hint(error)) is not None:
