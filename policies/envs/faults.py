@@ -46,16 +46,20 @@ _RESET_TAKES_LESS = re.compile(r"\breset\(\) got an unexpected keyword argument 
 """What Python says where an env has the `reset` of an older Gym, or a part of Gymnasium's."""
 _BY_WORDS = (
     (
-        Exception,
+        BaseException,
         _PYGAME_IS_CLOSED,
-        "pygame has one display for all environments of a process: if another one has closed it, give each a process "
-        "of its own: env.own_process: true.",
+        (
+            "pygame has one display for all environments of a process: if another one has closed it, give each a process "
+            "of its own: env.own_process: true."
+        ),
     ),
     (
         TypeError,
         _RESET_TAKES_LESS,
-        "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or wrap "
-        "it in a class of your own that calls it without.",
+        (
+            "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or wrap "
+            "it in a class of your own that calls it without."
+        ),
     ),
 )
 """What to do about errors of some class with some words."""
