@@ -49,16 +49,16 @@ _BY_WORDS = (
         BaseException,
         _PYGAME_IS_CLOSED,
         (
-            "pygame has one display for all environments of a process: if another one has closed it, give each a process "
-            "of its own: env.own_process: true."
+            "pygame has one display for all environments of a process: if another one has closed it, give each a "
+            "process of its own: env.own_process: true."
         ),
     ),
     (
         TypeError,
         _RESET_TAKES_LESS,
         (
-            "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or wrap "
-            "it in a class of your own that calls it without."
+            "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or "
+            "wrap it in a class of your own that calls it without."
         ),
     ),
 )
