@@ -13,16 +13,20 @@ from dataclasses import dataclass, replace
 
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
+from policies.envs.tallies import Reached
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.service.storage_health import is_of_store
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.store.patience import impatient
+from tune_jobs.sweeps.reached import as_reached, reached_by_now
 from tune_jobs.sweeps.status import SweepStatus, status_of
 
 FRESH_S = 0.4
 """How old what is told of a running sweep may be; of one with thousands of trials it may be older."""
 _OLDEST_LOOK_S, _OLDEST_STATUS_S, _OLDEST_WINNER_S = 2.0, 5.0, 5.0
+_SILENCE_S = 5.0
+"""How long no trial of a sweep is written until it is looked for how far they are within an iteration."""
 _SHARE = 0.02
 """The share of a core that following one sweep takes, unless it would be too old then."""
 
@@ -44,7 +48,7 @@ class Trials:
     """The trials of a sweep as they were at some time."""
 
     records: tuple[TrialRecord, ...]
-    """By index; a record that was not written meanwhile is the object that it was."""
+    """By index; a record that has not changed meanwhile is the object that it was."""
     scores: Mapping[str, float | None]
     """The score of each by its id, None if it can't win."""
     stamps: Mapping[str, tuple[int, ...]]
@@ -56,6 +60,13 @@ class Seen:
 
     status: SweepStatus
     trials: Trials
+    """Its trials, those that run with what they have trained since they were written, where that is long ago."""
+    written: Trials
+    """Its trials as their records have them."""
+    written_at: float
+    """When it was noticed that a record was written; monotonic seconds."""
+    reached: Mapping[str, Reached]
+    """How far running trials are within their iterations, by their ids, as far as it was looked for."""
     stamp: tuple[int, ...]
     """Of the sweep's record; another one means another record."""
     best_stamp: tuple[int, ...]
@@ -141,18 +152,38 @@ class Statuses:
         if record.name != sweep.name:
             # Somebody has renamed its folder: by that name it is listed and asked for.
             record = record.model_copy(update={"name": sweep.name})
-        trials = None if known is None else known.trials
-        if trials is None or trials.stamps != stamps:
-            trials = _read(sweep, stamps, trials)
+        written, trials, written_at, reached = self._trials(sweep, stamps, known)
         now = self._clock()
         # To read all of them is not what it takes to follow them.
         looked = Done(now, 0.0 if known is None else now - began)
         if known is not None and is_same and (known.of is trials or not known.summed_up.is_due(now, _OLDEST_STATUS_S)):
-            return replace(known, trials=trials, looked=looked)
+            return replace(known, trials=trials, written=written, written_at=written_at, reached=reached, looked=looked)
         # Before the winner is read: a later one has another stamp.
         best_stamp = sweep.best_stamp()
         status = status_of(sweep, record, trials.records)
-        return Seen(status, trials, stamp, best_stamp, looked, Done(self._clock(), self._clock() - now), of=trials)
+        summed_up = Done(self._clock(), self._clock() - now)
+        return Seen(status, trials, written, written_at, reached, stamp, best_stamp, looked, summed_up, of=trials)
+
+    def _trials(
+        self, sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Seen | None
+    ) -> tuple[Trials, Trials, float, Mapping[str, Reached]]:
+        """Return the trials as they were written, as they are now, when one was written, and how far they are."""
+        now, is_driven = self._clock(), sweep.is_driven()
+        if known is None:
+            written = _read(sweep, stamps, None)
+            return written, written, now, {}
+        reached = known.reached if is_driven else {}
+        if known.written.stamps != stamps:
+            written = _read(sweep, stamps, known.written)
+            # One that was written may go on from an earlier checkpoint.
+            before = {id(record) for record in known.written.records}
+            names = {record.trial_id for record in written.records if id(record) in before}
+            reached = {name: each for name, each in reached.items() if name in names}
+            return written, _with(written, reached), now, reached
+        if is_driven and now - known.written_at >= _SILENCE_S:
+            reached = reached_by_now(sweep, known.written.records)
+        trials = known.trials if reached == known.reached else _with(known.written, reached)
+        return known.written, trials, known.written_at, reached
 
     def all(self) -> list[Seen]:
         """Return all sweeps, by name; those that can't be read give a warning.
@@ -179,6 +210,14 @@ class Statuses:
         self._seen.pop(name, None)
         with self._lock:
             self._locks.pop(name, None)
+
+
+def _with(written: Trials, reached: Mapping[str, Reached]) -> Trials:
+    """Return the trials with what some of them have trained since they were written."""
+    if not reached:
+        return written
+    records = tuple(as_reached(record, reached.get(record.trial_id)) for record in written.records)
+    return replace(written, records=records)
 
 
 def _is_text(name: str) -> bool:

@@ -26,10 +26,17 @@ def as_reached(record: TrialRecord, reached: Reached | None) -> TrialRecord:
     return record.model_copy(update={"num_env_steps": reached.num_env_steps, "time_s": reached.time_s})
 
 
-def up_to_now(store: Sweep, trials: Sequence[TrialRecord]) -> Sequence[TrialRecord]:
-    """Return the trials of a sweep with what those that run on this machine have trained by now."""
+def reached_by_now(store: Sweep, trials: Sequence[TrialRecord]) -> dict[str, Reached]:
+    """Return how far the running trials of a sweep are, by their ids; those on other machines are left out."""
     # What a process that was killed had trained since is lost.
     if all(trial.status != "running" for trial in trials) or not store.is_driven():
-        return trials
+        return {}
     read = reached_of(store)
-    return [as_reached(trial, read(trial.trial_id) if trial.status == "running" else None) for trial in trials]
+    running = [trial.trial_id for trial in trials if trial.status == "running"]
+    return {trial_id: reached for trial_id in running if (reached := read(trial_id)) is not None}
+
+
+def up_to_now(store: Sweep, trials: Sequence[TrialRecord]) -> Sequence[TrialRecord]:
+    """Return the trials of a sweep with what those that run on this machine have trained by now."""
+    reached = reached_by_now(store, trials)
+    return [as_reached(trial, reached.get(trial.trial_id)) for trial in trials] if reached else trials
