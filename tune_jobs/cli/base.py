@@ -45,6 +45,7 @@ class CommandGroup(click.Group):
         except (click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except click.ClickException as error:
+            self._tell_where_it_goes(error, ctx.invoked_subcommand)
             if ctx.meta.get(_JSON):
                 _print_json_error(error.format_message(), "", error.exit_code)
             raise
@@ -73,6 +74,11 @@ class CommandGroup(click.Group):
                 hint = f"This is a bug in tune-jobs. The traceback is in {_save_traceback()}; --debug prints it."
             _print_error(ctx, message, hint, TuneJobsError.exit_code)
             ctx.exit(TuneJobsError.exit_code)
+
+    def _tell_where_it_goes(self, error: click.ClickException, command: str | None) -> None:
+        if isinstance(error, click.NoSuchOption) and any(error.option_name in own.opts for own in self.params):
+            name, error.possibilities = error.option_name, None
+            error.message = f"{name} goes before the command: tune-jobs {name} ... {command}"
 
 
 def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:

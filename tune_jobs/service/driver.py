@@ -98,6 +98,10 @@ def warm_up(stack: contextlib.ExitStack, settings: Mapping[str, Any]) -> None:
         settings: The modules that sweeps may name, the folder to be in, and whether they are started.
     """
     allow_modules(settings["modules"])
+    if settings["modules"]:
+        # A `launch` finds them in the folder that it is typed in, too. Here that is where the service was started.
+        with contextlib.suppress(OSError):  # that folder is gone
+            sys.path.append(os.getcwd())  # noqa: PTH109 (sys.path holds strings)
     os.chdir(settings["working_folder"])
     if not settings["warm_ray"]:
         _import_all()
