@@ -45,10 +45,10 @@ class CommandGroup(click.Group):
         except (click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except click.ClickException as error:
-            self._tell_where_it_goes(error, ctx.invoked_subcommand)
+            told = self._placed(error, ctx.invoked_subcommand)
             if ctx.meta.get(_JSON):
-                _print_json_error(error.format_message(), "", error.exit_code)
-            raise
+                _print_json_error(told.format_message(), "", told.exit_code)
+            raise told from None
         except KeyboardInterrupt as interruption:
             hint = _hint_after(interruption, ctx.invoked_subcommand or "")
             with losing_what_nobody_reads(True):  # noqa: FBT003
@@ -75,10 +75,12 @@ class CommandGroup(click.Group):
             _print_error(ctx, message, hint, TuneJobsError.exit_code)
             ctx.exit(TuneJobsError.exit_code)
 
-    def _tell_where_it_goes(self, error: click.ClickException, command: str | None) -> None:
+    def _placed(self, error: click.ClickException, command: str | None) -> click.ClickException:
+        """Return the error, or if an option of all commands stands behind one, another that says where it goes."""
         if isinstance(error, click.NoSuchOption) and any(error.option_name in own.opts for own in self.params):
-            name, error.possibilities = error.option_name, None
-            error.message = f"{name} goes before the command: tune-jobs {name} ... {command}"
+            name = error.option_name
+            return click.UsageError(f"{name} goes before the command: tune-jobs {name} ... {command}", error.ctx)
+        return error
 
 
 def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
