@@ -9,10 +9,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, distribution, packages_distributions, version
 from pathlib import PurePath
+from typing import TYPE_CHECKING
 
-from packaging.requirements import InvalidRequirement, Requirement
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 _MOST = 3
 """How many requirements are named."""
@@ -49,6 +50,8 @@ def module_of_file(file: str) -> str | None:
 @lru_cache
 def _distribution_of(top: str) -> str | None:
     """Return the distribution, with its version, that installed a top-level module."""
+    from importlib.metadata import packages_distributions, version
+
     # Of a namespace that several share nothing is known.
     names = set(packages_distributions().get(top, ()))
     return " ".join(f"{name} {version(name)}" for name in names) if len(names) == 1 else None
@@ -57,6 +60,8 @@ def _distribution_of(top: str) -> str | None:
 @lru_cache
 def _unmet(top: str) -> dict[str, str | None]:
     """Return the requirements of a top-level module's distribution that are not met, each with what is installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
     known = _distribution_of(top)
     if known is None:
         return {}
@@ -74,6 +79,11 @@ def _unmet(top: str) -> dict[str, str | None]:
 
 def _requirements(name: str) -> Iterator[Requirement]:
     """Yield what a distribution asks for on this machine without any of its extras."""
+    from importlib.metadata import distribution
+
+    # Loaded here: whoever only acts does without it, and then nothing is said of requirements.
+    from packaging.requirements import InvalidRequirement, Requirement
+
     for text in distribution(name).requires or ():
         try:
             wanted = Requirement(text)
