@@ -166,3 +166,12 @@ def test_a_status_has_what_is_trained_by_now_while_a_process_drives_the_sweep(
     monkeypatch.setattr(SweepStore, "is_driven", lambda _: True)
     now = up_to_now(store, trials)
     assert [(trial.num_env_steps, trial.time_s) for trial in now] == [(130, 20.0), (100, 0.0), (100, 0.0)]
+
+
+def test_a_trial_whose_record_can_no_more_be_read_evaluates_no_more(within: Within) -> None:
+    within.reached["t0000"] = Reached(1, 500, 4, 50.0, evaluates=True)
+    within.clock.now += 6
+    assert "evaluating" in summary_line(within.monitor)
+    within.monitor.begin_stage("", [make_trial(1)], {"t0001": 1_000})
+    assert "1 running" in summary_line(within.monitor)
+    assert "evaluating" not in summary_line(within.monitor)

@@ -168,8 +168,9 @@ class SweepMonitor:
     @property
     def num_evaluating(self) -> int:
         """How many of the running trials play an evaluation, as far as was looked for."""
-        within = list(self._within.items())
-        return sum(each.evaluates and self.records[name].status == "running" for name, each in within)
+        evaluating = [self.records.get(name) for name, each in list(self._within.items()) if each.evaluates]
+        # Of a sweep that is only shown, a record that was damaged meanwhile is left out.
+        return sum(record is not None and record.status == "running" for record in evaluating)
 
     def best(self) -> Selection | None:
         """Return the winner so far, by the rule that will choose the winner; None while no trial is usable."""
