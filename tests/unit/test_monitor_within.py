@@ -8,7 +8,9 @@ from rich.console import Console
 
 from analysis.records import TrialRecord
 from policies.envs.tallies import Reached, Tally
+from policies.errors import CheckpointError
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.sweeps.live_table import render, summary_line
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.reached import reached_of, up_to_now
@@ -175,3 +177,14 @@ def test_a_trial_whose_record_can_no_more_be_read_evaluates_no_more(within: With
     within.monitor.begin_stage("", [make_trial(1)], {"t0001": 1_000})
     assert "1 running" in summary_line(within.monitor)
     assert "evaluating" not in summary_line(within.monitor)
+
+
+@pytest.mark.parametrize("error", [CheckpointError("It is a link.", "Remove it."), OSError("no space")], ids=str)
+def test_where_a_trial_can_t_be_looked_at_nothing_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def raises(_: TrialStore) -> Path:
+        raise error
+
+    monkeypatch.setattr(TrialStore, "tally_path", property(raises))
+    assert reached_of(SweepStore(tmp_path / "mine"))("t0000") is None

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 
 from analysis.records import TrialRecord
 from policies.envs.tallies import Reached, read_tally
+from policies.errors import TuneJobsError
 from tune_jobs.store.contract import Sweep
 
 
 def reached_of(store: Sweep) -> Callable[[str], Reached | None]:
     """Return what reads how far a running trial of a sweep is, by its id; None: its process is on another machine."""
-    return lambda trial_id: read_tally(store.trial(trial_id).tally_path)
+
+    def read(trial_id: str) -> Reached | None:
+        # Where its folder can't be read or made, others say so; whoever only looks goes on.
+        with contextlib.suppress(TuneJobsError, OSError):
+            return read_tally(store.trial(trial_id).tally_path)
+        return None
+
+    return read
 
 
 def as_reached(record: TrialRecord, reached: Reached | None) -> TrialRecord:
