@@ -243,10 +243,11 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path: Path) -> None:
         str(seeds[3]): {"how": "exit", "marker": str(tmp_path / "died")},
         str(seeds[4]): {"how": "hang", "at": 70, "marker": str(tmp_path / "hung")},
     }
-    # In a pack some would be tried again because others died.
+    # In a pack some would be tried again because others died. Within the timeout a busy machine imports RLlib and builds
+    # a trial, too.
     spec = make_spec(
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
-        iteration_timeout_s=25, engine="rllib", confirm="none",
+        iteration_timeout_s=90, engine="rllib", confirm="none",
     )  # fmt: skip
     told: dict[str, TrialRecord] = {}
 
@@ -274,7 +275,7 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path: Path) -> None:
     hung = told["t0004"]
     assert hung.num_env_steps > 60 * FAST["num_envs"]
     first = present(hung.error).splitlines()[0]
-    assert "died: an iteration took longer than iteration_timeout_s (25 s). It hung at " in first
+    assert "died: an iteration took longer than iteration_timeout_s (90 s). It hung at " in first
     assert re.search(r"/tune_jobs_test_envs\.py:\d+ in _go_wrong\.$", first)
     store = SweepStore(result.folder)
     for trial in result.trials:

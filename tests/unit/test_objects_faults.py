@@ -78,8 +78,10 @@ def test_a_conditional_write_whose_answer_is_lost_is_known_again(
     act: str,
 ) -> None:
     if act == "slow":
-        monkeypatch.setattr(clients, "REQUEST_TIMEOUT_S", 0.15)
-        settings = {"delay_s": 0.3}
+        # Long enough for a request that nothing delays, on a busy machine too.
+        monkeypatch.setattr(clients, "REQUEST_TIMEOUT_S", 2.0)
+        monkeypatch.setattr(clients, "PATIENCE_S", 30.0)
+        settings = {"delay_s": 3.0}
     else:
         settings = {}
     faults.rule(act, kinds="PUT", **settings)
