@@ -243,8 +243,8 @@ def test_each_trial_fails_for_itself_and_is_retried(tmp_path: Path) -> None:
         str(seeds[3]): {"how": "exit", "marker": str(tmp_path / "died")},
         str(seeds[4]): {"how": "hang", "at": 70, "marker": str(tmp_path / "hung")},
     }
-    # In a pack some would be tried again because others died. Within the timeout a busy machine imports RLlib and builds
-    # a trial, too.
+    # In a pack some would be tried again because others died. Within the timeout a busy machine imports RLlib and
+    # builds a trial, too.
     spec = make_spec(
         env={"id": "TestTrouble-v0", "args": {"troubles": troubles}}, num_samples=5, max_retries=1,
         iteration_timeout_s=90, engine="rllib", confirm="none",
