@@ -21,6 +21,7 @@ from policies.envs import faults as env_faults
 from policies.envs import modules as env_modules
 from policies.envs.rendering import choose_before_import
 from policies.errors import EnvFailedError, TuneJobsError, said_by
+from policies.guard.prints import print_to
 
 if TYPE_CHECKING:
     from policies.acting.evaluate import Episodes
@@ -102,7 +103,8 @@ def _answer(asked: Mapping[str, Any], told: calls.Page) -> dict[str, Any]:
 
 
 def _see(asked: Mapping[str, Any]) -> None:
-    """Give this process the parent's folder, import path and allowed modules."""
+    """Give this process the parent's log, folder, import path and allowed modules."""
+    print_to(asked["log"])
     env_modules.allow_modules(asked["modules"])
     if os.getcwd() != asked["folders"][0]:  # noqa: PTH109
         os.chdir(asked["folders"][0])

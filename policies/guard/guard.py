@@ -185,11 +185,14 @@ class EnvGuard:
         """How long an episode took in a child, in seconds, by what tells environments apart; see `spread`."""
         self.look: Callable[[], None] = lambda: None
         """Called from time to time while a job is waited for."""
+        self.log: Path | None = None
+        """What environments print to; None: standard error."""
 
     def others(self, num: int) -> list[EnvGuard]:
         """Return further guards, for jobs at the same time, whose children begin; they end with this one."""
         self._others += [EnvGuard() for _ in range(num - len(self._others))]
         for other in self._others[:num]:
+            other.log = self.log
             other.start()
         return self._others[:num]
 
@@ -261,6 +264,7 @@ class EnvGuard:
         child = self._ready_child()
         asked = {
             "job": job,
+            "log": None if self.log is None else str(absolute(self.log)),
             "folders": child.surroundings.folders,
             "modules": sorted(child.modules),
             "module_folders": module_folders(),

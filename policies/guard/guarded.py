@@ -31,6 +31,21 @@ from policies.packed.envs.make import StepTime
 from policies.portable.file import PortablePolicy, save_policy
 
 
+@contextlib.contextmanager
+def printing_to(log: Path) -> Iterator[None]:
+    """Have a log get what environments print in the block's jobs, where a line of the terminal tells how far they are.
+
+    Args:
+        log: The log, which is made with the first job; if it cannot be written, they print to standard error.
+    """
+    with guarding() as guard:
+        before, guard.log = guard.log, log
+        try:
+            yield
+        finally:
+            guard.log = before
+
+
 def check_env(
     env_id: str,
     env_args: Mapping[str, Any] | None,

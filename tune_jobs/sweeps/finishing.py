@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,10 +115,13 @@ class _Finish:
         doing = "filming the best policy"
         self._attempt("video", doing, films)
 
-    def _working(self, doing: str) -> AbstractContextManager[Callable[[str], None]]:
+    @contextlib.contextmanager
+    def _working(self, doing: str) -> Iterator[Callable[[str], None]]:
+        from policies.guard.guarded import printing_to
         from tune_jobs.sweeps.live_view import working
 
-        return working(self._store.name, doing, self._progress)
+        with printing_to(self._store.driver_log), working(self._store.name, doing, self._progress) as say:
+            yield say
 
     def _attempt(self, what: str, doing: str, make: Callable[[Callable[[str], None]], dict[str, Path]]) -> None:
         if self._asked_to_stop():
