@@ -87,6 +87,7 @@ class Running:
             f"{self._env_id} raised an error in {method}() of the episode with seed {self.seed}, after {self.length} "
             "steps",
             error,
+            in_step=method == "step",
         )
 
 

@@ -167,7 +167,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         try:
             observations, rewards, terminated, truncated, _ = self.env.step(actions)
         except BaseException as error:
-            raise env_failed(f"{self._env_id} raised an error in step()", error) from error
+            raise env_failed(f"{self._env_id} raised an error in step()", error, in_step=True) from error
         row = self._shape[:1]
         observations = self._as_array(observations, "observations", self._shape)
         rewards = self._as_array(rewards, "rewards", row).reshape(row)

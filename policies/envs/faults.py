@@ -63,6 +63,11 @@ _BY_WORDS = (
     ),
 )
 """What to do about errors of some class with some words."""
+_REFUSES = re.compile("(?i)valid|legal|allowed|permitted|feasible|available|masked")
+_IF_REFUSED = (
+    "If it refuses an action that is not allowed at the time, a mask must say so: see 'Actions that are not always "
+    "allowed' in docs/guides/own-environment.md."
+)
 _PLACE = "_place_in_its_process"
 _notes_signals = False
 _signalled = False
@@ -103,13 +108,16 @@ def is_of_env(error: BaseException) -> bool:
     return not isinstance(error, KeyboardInterrupt)
 
 
-def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or choose another one.") -> EnvFailedError:
+def env_failed(
+    what: str, error: BaseException, hint: str = "Mend the env, or choose another one.", *, in_step: bool = False
+) -> EnvFailedError:
     """Return the error that reports an exception of an env's code.
 
     Args:
         what: What failed, such as "CartPole-v1 raised an error in step()".
         error: What the env raised.
         hint: What to do, if the error itself does not say.
+        in_step: Whether it was given an action, which it may have refused.
 
     Raises:
         BaseException: The error itself, if it came from a signal to this process.
@@ -119,6 +127,8 @@ def env_failed(what: str, error: BaseException, hint: str = "Mend the env, or ch
     detail = said_by(error)
     if (place := place_in_env(error)) is not None:
         detail += f" ({place})" if detail else f"at {place}"
+    if in_step and _REFUSES.search(f"{type(error).__name__}: {said_by(error)}"):
+        hint = f"{hint} {_IF_REFUSED}"
     return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint_on(error, hint))
 
 

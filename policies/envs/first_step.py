@@ -33,13 +33,18 @@ _RESET_HINT = (
 )
 
 
-def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Reset an environment, step it once with some action, check what it returns, and return the first infos.
+def check_first_step(
+    env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]
+) -> tuple[Mapping[str, Any], str | None]:
+    """Reset an environment, step it once with some action, check what it returns, and reset it again.
 
     Args:
         env: The environment.
         env_id: Its id, for messages.
         env_args: The arguments of its constructor, for messages.
+
+    Returns:
+        The first infos, and how the first observation differs when the same seed is given again; None: it does not.
 
     Raises:
         EnvFailedError: The env raised an error.
@@ -53,6 +58,7 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
     space = copy.deepcopy(env.action_space)  # the env may draw from its own
     space.seed(0)
     action = sample(env, space, observation)
+    first = np.array(observation, np.float64)  # the env may write the next one into it
     # As the env itself gets it, so that its author can repeat the call.
     own = space.own(action) if is_made(space) else action
     _check_call(
@@ -60,7 +66,21 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
         find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {own!r} after a reset",
         hint=_STEP_HINT,
     )  # fmt: skip
-    return dict(infos)
+    return dict(infos), _other_again(env, first)
+
+
+def _other_again(env: gym.Env[Any, Any], first: NDArray[np.float64]) -> str | None:
+    """Reset an environment with the first seed once more, and say where its observation is another one."""
+    with contextlib.suppress(Exception):  # that it can be reset only once is told by the trials
+        again = np.asarray(env.reset(seed=0)[0], np.float64)
+        # What is computed in another order differs by less.
+        differs = ~np.isclose(first, again, rtol=1e-3, atol=1e-5, equal_nan=True)
+        differs[: num_masked(env.observation_space)] = False
+        if differs.any():
+            number = int(differs.argmax())
+            values = f"{first.flat[number]:g} and then {again.flat[number]:g}"
+            return f"{_place_in(env.observation_space, number)} is {values}"
+    return None
 
 
 def _check_call(
@@ -92,7 +112,9 @@ def _check_call(
                     mask_hint(env, error.infos),
                 ) from error
             if problem is None:
-                raise env_failed(complaint, error, f"Check the env's arguments, or mend its {method}().") from error
+                raise env_failed(
+                    complaint, error, f"Check the env's arguments, or mend its {method}().", in_step=method == "step"
+                ) from error
     if problem is not None:
         raise EnvError(f"{method}() of {env_id} returns {problem}.", hint)
     return returned
@@ -197,12 +219,18 @@ def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
 
 def _not_finite(array: NDArray[Any], space: gym.Space[Any]) -> str | None:
     """Say which number is not finite, and where the environment itself has it: behind the mask, if there is one."""
-    seen, array = seen_by_networks(space), array[num_masked(space) :]
-    for number, place in enumerate(np.ndindex(array.shape)):
-        if not is_sound(value := np.asarray(array[place])):
-            where = seen.name_of(number) if isinstance(seen, FlatBox) else list(place)
-            return f"observations that are not finite: {value} at {where}{_if_finite(value)}"
+    for number in range(num_masked(space), array.size):
+        if not is_sound(value := np.asarray(array.flat[number])):
+            return f"observations that are not finite: {value} at {_place_in(space, number)}{_if_finite(value)}"
     return None
+
+
+def _place_in(space: gym.Space[Any], number: int) -> str:
+    """Name the place of a number in the environment's own observation: behind the mask, if there is one."""
+    seen, number = seen_by_networks(space), number - num_masked(space)
+    if isinstance(seen, FlatBox):
+        return seen.name_of(number)
+    return str([int(index) for index in np.unravel_index(number, seen.shape or ())])
 
 
 def _unflattened_problem(observation: Any, space: gym.Space[Any]) -> str | None:

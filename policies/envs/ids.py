@@ -7,6 +7,8 @@ id such as `module:Env-v0` names, allowed or not.
 from __future__ import annotations
 
 import contextlib
+import copy
+import sys
 from collections.abc import Iterable
 from functools import partial
 from importlib.util import find_spec
@@ -77,7 +79,7 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         if is_atari_id(env_id) and not any(map(is_atari_id, gym.registry)):
             guess, hint = " It is a game of the Arcade Learning Environment, which is not installed.", INSTALL
         raise EnvError(f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}", hint)
-    return found, gym.registry[found]
+    return found, _entry(found)
 
 
 def module_of(env_id: str) -> str | None:
@@ -97,11 +99,9 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
     is_class = isinstance(thing, type) and issubclass(thing, gym.Env)
     # A class of one's own may be called as an environment of another package is, without its version.
     if found is not None and (not is_class or _is_registered_by(found, module_name, thing.__module__)):
-        return f"{module_name}:{found}", gym.registry[found]
+        return f"{module_name}:{found}", _entry(found)
     if is_class:
-        # Gymnasium reads the class's metadata, which of a Wrapper is a property.
-        creator: Any = partial(thing) if isinstance(thing.metadata, property) else thing
-        return env_id, EnvSpec(env_id, entry_point=cast("EnvCreator", creator))
+        return env_id, EnvSpec(env_id, entry_point=_creator(thing))
     classes = [
         name
         for name, value in vars(module).items()
@@ -113,6 +113,26 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
         _if_it_registers(module)
         or "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
     )
+
+
+def _entry(env_id: str) -> EnvSpec:
+    """Return a registered id's entry, which of a gymnasium.Wrapper is one that Gymnasium makes."""
+    spec = gym.registry[env_id]
+    maker = spec.entry_point
+    if isinstance(maker, str):
+        # One that is not imported yet is no class of a module that was named.
+        module, _, name = maker.partition(":")
+        maker = getattr(sys.modules.get(module), name, None)
+    if not isinstance(maker, type) or not issubclass(maker, gym.Wrapper):
+        return spec
+    changed = copy.copy(spec)
+    changed.entry_point = _creator(maker)
+    return changed
+
+
+def _creator(kind: type[gym.Env[Any, Any]]) -> EnvCreator:
+    # Gymnasium reads the class's metadata, which of a Wrapper is a property.
+    return cast("EnvCreator", partial(kind) if isinstance(kind.metadata, property) else kind)
 
 
 def _if_it_registers(module: ModuleType) -> str:

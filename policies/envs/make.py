@@ -100,6 +100,8 @@ class EnvInfo:
     """The name of an info that looks like a mask of actions, which is not used."""
     is_flattened: bool = False
     """Whether its own observations are neither vectors nor images, and were made such (`policies.envs.flat`)."""
+    unrepeated: str | None = None
+    """How its first observation differs when the same seed is given again; None: it does not."""
 
     @property
     def observes_images(self) -> bool:
@@ -144,12 +146,12 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         _check_action_space(info, algorithm)
         _check_observation_space(info)
         _check_keys(info)
-        infos = check_first_step(env, info.env_id, constructor_args(info.env_args))
+        infos, unrepeated = check_first_step(env, info.env_id, constructor_args(info.env_args))
     finally:
         close_env(env)
     if mask is None and wrappers.action_mask is None and looks_like_mask(infos.get(ACTION_MASK), info.action_space):
-        return replace(info, unused_mask=ACTION_MASK)
-    return info
+        info = replace(info, unused_mask=ACTION_MASK)
+    return replace(info, unrepeated=unrepeated)
 
 
 def make_env(

@@ -135,6 +135,7 @@ def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str
         "mask": info.mask,
         "unused_mask": info.unused_mask,
         "is_flattened": info.is_flattened,
+        "unrepeated": info.unrepeated,
     }
 
 

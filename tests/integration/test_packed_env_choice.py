@@ -1,5 +1,6 @@
 """How the environments of a pack are stepped, and which cannot be packed."""
 
+import re
 from typing import Any
 
 import pytest
@@ -7,6 +8,7 @@ from policy_factory import register_test_envs
 from test_packed_envs import own_modules
 
 from policies.errors import EnvError
+from policies.guard import guarded
 from policies.packed.envs.make import StepTime, check_seedable, choose_kind, measure_step
 from tests.narrowing import present
 
@@ -84,3 +86,10 @@ def test_envs_that_cannot_be_seeded_are_refused_with_what_differs(name: str, wor
     with pytest.raises(EnvError, match=words) as caught:
         check_seedable(f"odd_envs:{name}", None)
     assert "engine: rllib" in caught.value.hint
+
+
+def test_the_guard_tells_of_what_cannot_be_seeded_too() -> None:
+    assert guarded.check_env("odd_envs:Slow", None).unrepeated is None
+    assert re.fullmatch(
+        r"\[0\] is -?[\d.]+ and then -?[\d.]+", present(guarded.check_env("odd_envs:Unseedable", None).unrepeated)
+    )

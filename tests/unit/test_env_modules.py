@@ -180,6 +180,23 @@ def test_a_wrapper_of_an_allowed_module_is_an_env_class_too(own: Path) -> None:
         make_env("own_walks:Limited", {"lenght": 2})
 
 
+@pytest.mark.parametrize("entry", ["Limited", "'own_wrapped:Limited'"])
+def test_a_wrapper_that_a_module_registers_is_an_env_too(own: Path, entry: str) -> None:
+    """Gymnasium refuses to make it: "Expect the environment metadata to be dict, actual type: <class 'module'>"."""
+    (own / "own_wrapped.py").write_text(
+        f"import gymnasium as gym\nfrom own_walks import Limited\n"
+        f"gym.register('OwnWalkWrapped-v0', {entry}, max_episode_steps=5, kwargs={{'length': 7}})\n"
+    )
+    allow_modules(["own_wrapped"])
+    info = check_env("own_wrapped:OwnWalkWrapped-v0", {"max_episode_steps": 1}, "ppo")
+    assert (info.env_id, info.max_episode_steps) == ("own_wrapped:OwnWalkWrapped-v0", 1)
+    env = make_env("own_wrapped:OwnWalkWrapped-v0")
+    env.reset(seed=0)
+    assert [env.step(0)[3] for _ in range(2)] == [False, True]
+    # The entry itself stays as it is.
+    assert not callable(getattr(gym.registry["OwnWalkWrapped-v0"].entry_point, "func", None))
+
+
 NAMESAKES = """
 import gymnasium as gym
 import own_walks

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any, TypeGuard
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces.utils import flatdim
 
 from analysis.wording import counted, duration
 from policies.acting.evaluate import MAX_EPISODE_STEPS
@@ -30,34 +32,52 @@ _FEW_NUMBERS = 3_000
 
 def env_notes(spec: SweepSpec, env: EnvInfo, step_us: float | None = None) -> list[str]:
     """Return notes on a sweep's environment, with its wrappers; `step_us` is how long an env step takes, if known."""
-    notes = []
+    return [*_on_observations(spec, env), *_on_actions(env), *_on_episodes(spec, env, step_us)]
+
+
+def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
     seen = seen_by_networks(env.observation_space)
     if isinstance(seen, FlatBox):
         kind = "images of shape" if env.observes_images else "vectors of shape"
-        notes.append(f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}.")
+        yield f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}."
         # Who observes the image alone would lose a mask that is a member beside it.
         if spec.rl_module is None and env.mask is None and (note := _note_on_image(env, seen.original)):
-            notes.append(note)
+            yield note
+        if note := _note_on_choices(seen):
+            yield note
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.
-        notes.append(f"Convolutions go over the first two dimensions of images. {hint}")
+        yield f"Convolutions go over the first two dimensions of images. {hint}"
+
+
+def _on_actions(env: EnvInfo) -> Iterator[str]:
     if is_made(actions := env.action_space):
         kind = f"{counted(len(actions.sizes), 'choice')}" if isinstance(actions, Choices) else "vectors"
-        notes.append(f"Actions of {env.env_id} are made of {kind}: {shortened(actions.original)}.")
+        yield f"Actions of {env.env_id} are made of {kind}: {shortened(actions.original)}."
     if env.mask is not None:
-        notes.append(
+        yield (
             f"Only actions that {env.env_id} allows, by {env.mask}, are drawn, learned and taken; networks do not see "
             "the mask."
         )
     elif env.unused_mask is not None:
-        notes.append(
+        yield (
             f"{env.env_id} gives info[{env.unused_mask!r}], which seems to say which actions are allowed, and which is "
             "not used: env.action_mask: true uses it."
+        )
+
+
+def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterator[str]:
+    if env.unrepeated is not None:
+        yield (
+            f"{env.env_id} was reset twice with the same seed, and its first observation differs: {env.unrepeated}. "
+            "Where an episode depends on more than its seed, a policy that is evaluated again on the same seeds gets "
+            "other returns. Let reset() leave nothing of the episode before, and draw all random numbers from "
+            "self.np_random."
         )
     if step_us is not None and env.max_episode_steps is None:
         longest_s = step_us / 1e6 * MAX_EPISODE_STEPS
         if longest_s >= _LONG_EPISODE_S:
-            notes.append(
+            yield (
                 f"{env.env_id} sets no limit to the env steps of an episode, and one takes {step_us / 1000:.1f} ms: an "
                 f"episode that does not end by itself is cut off after {MAX_EPISODE_STEPS:,}, which take "
                 f"{duration(longest_s)}. Each evaluation plays {counted(spec.evaluation.num_episodes, 'episode')}, the "
@@ -65,11 +85,10 @@ def env_notes(spec: SweepSpec, env: EnvInfo, step_us: float | None = None) -> li
             )
     target = spec.stop.training_return
     if env.threshold is not None and target is not None and target < env.threshold:
-        notes.append(
+        yield (
             f"stop.training_return {target:g} is below {env.env_id}'s threshold {env.threshold:g}: "
             "trials may end before they solve it."
         )
-    return notes
 
 
 def _note_on_image(env: EnvInfo, space: gym.Space[Any]) -> str | None:
@@ -81,6 +100,20 @@ def _note_on_image(env: EnvInfo, space: gym.Space[Any]) -> str | None:
     return (
         f"{sizes[keys]:,} numbers of these vectors are those of an image, {named(keys)}: networks see no pixel beside "
         f"another, and have a weight for every number and unit. {image_alone_hint(env.env_id, keys)}"
+    )
+
+
+def _note_on_choices(vectors: FlatBox) -> str | None:
+    """Return a note on the member whose choices make the most numbers; None: they are few, or a small part."""
+    choices = (gym.spaces.Discrete, gym.spaces.MultiDiscrete)
+    sizes = {keys: flatdim(leaf) for keys, leaf in leaves(vectors.original, ()) if isinstance(leaf, choices)}
+    keys = max(sizes, key=lambda each: sizes[each], default=None)
+    if keys is None or sizes[keys] < max(_FEW_NUMBERS, vectors.shape[0] / 2):
+        return None
+    return (
+        f"{sizes[keys]:,} numbers of these vectors are the choices of {named(keys)}, one for each value that there is: "
+        "networks have a weight for every number and unit. An ObservationWrapper of your own may leave them out, or "
+        "give values that are amounts as numbers, in a Box."
     )
 
 

@@ -175,7 +175,7 @@ class SubEnvs:
             )
 
     def _failed(self, method: str, error: BaseException) -> EnvError:
-        return env_failed(f"{self._env_id} raised an error in {method}()", error)
+        return env_failed(f"{self._env_id} raised an error in {method}()", error, in_step=method == "step")
 
 
 def find_unsound(

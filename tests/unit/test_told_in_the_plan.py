@@ -1,0 +1,192 @@
+"""What a plan says of environments that do what Gymnasium allows, and that those who train seldom want."""
+
+from collections.abc import Iterator
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.policy import RandomPolicy
+from policies.envs.checked import CheckedEnvs
+from policies.envs.faults import env_failed
+from policies.envs.make import check_env, make_vector_env
+from policies.errors import EnvFailedError
+from policies.packed.envs.make import make_packed_envs
+from tune_jobs.plan.env_notes import env_notes
+from tune_jobs.spec.file import load_spec
+
+NUMBERS = spaces.Box(-9, 9, (3,), np.float32)
+BESIDE: dict[str, gym.Space[Any]] = {
+    "choice": spaces.Discrete(3), "way": spaces.Dict({"left": NUMBERS, "right": NUMBERS})
+}  # fmt: skip
+
+
+class Walk(gym.Env[Any, Any]):
+    """Observes something that differs from the first episode to the next, and refuses an action at times."""
+
+    def __init__(
+        self, observations: gym.Space[Any] = NUMBERS, left: float = 0.0, refuses: Exception | None = None
+    ) -> None:
+        self.observation_space, self.action_space = observations, spaces.Discrete(2)
+        self.left, self.refuses = left, refuses
+        self.resets = self.steps = 0
+
+    def seen(self) -> Any:
+        numbers = np.array([1, 2, 3 + self.left * (self.resets > 1)], np.float32)
+        if isinstance(self.observation_space, spaces.Box):
+            return numbers
+        if isinstance(self.observation_space, spaces.Dict) and "way" in self.observation_space.spaces:
+            seen = {"choice": 1, "way": {"left": np.zeros(3, np.float32), "right": numbers}}
+            return (
+                seen | {"action_mask": np.array([self.resets < 2, 1])}
+                if "action_mask" in self.observation_space.spaces
+                else seen
+            )
+        self.observation_space.seed(0)
+        return self.observation_space.sample()
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.resets, self.steps = self.resets + 1, 0
+        return self.seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        if self.refuses is not None and self.steps == 3:
+            raise self.refuses
+        return self.seen(), 1.0, self.steps >= 5, False, {}
+
+
+@pytest.fixture(autouse=True)
+def _forget() -> Iterator[None]:
+    yield
+    gym.registry.pop("ToldWalk-v0", None)
+
+
+def notes_on(**args: Any) -> list[str]:
+    gym.register("ToldWalk-v0", cast("Any", lambda: Walk(**args)))
+    spec = load_spec({"env": "ToldWalk-v0", "algorithm": "ppo"})
+    return [note for note in env_notes(spec, check_env("ToldWalk-v0", None, "ppo")) if "are made vectors" not in note]
+
+
+# -- what an episode leaves to the next
+
+
+@pytest.mark.parametrize(
+    ("observations", "place"),
+    [
+        (NUMBERS, r"[2]"),
+        (spaces.Dict(BESIDE), "observation['way']['right'][2]"),
+        (spaces.Dict({"action_mask": spaces.MultiBinary(2), **BESIDE}), "observation['way']['right'][2]"),
+    ],
+    ids=["numbers", "members", "members and a mask"],
+)
+def test_a_first_observation_that_differs_on_the_same_seed_is_told(observations: gym.Space[Any], place: str) -> None:
+    told = [note for note in notes_on(observations=observations, left=0.25) if "reset twice" in note]
+    assert len(told) == 1
+    assert f"its first observation differs: {place} is 3 and then 3.25." in told[0]
+
+
+def test_nothing_is_said_of_what_is_rounded_otherwise_or_of_another_mask() -> None:
+    assert notes_on(left=1e-6) == []
+    gym.registry.pop("ToldWalk-v0")
+    told = notes_on(observations=spaces.Dict({"action_mask": spaces.MultiBinary(2), **BESIDE}))
+    assert [note for note in told if "reset twice" in note] == []
+
+
+def test_an_env_that_can_be_reset_only_once_is_left_to_its_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = Walk.seen
+
+    def once(self: Walk) -> Any:
+        if self.resets > 1:
+            raise RuntimeError("no more")
+        return seen(self)
+
+    monkeypatch.setattr(Walk, "seen", once)
+    assert notes_on() == []
+
+
+# -- choices by the thousand
+
+
+@pytest.mark.parametrize(
+    ("observations", "place", "size"),
+    [
+        (
+            spaces.Dict({"edges": spaces.MultiDiscrete(np.full((2, 50), 40)), "n": NUMBERS}),
+            "observation['edges']",
+            "4,000",
+        ),
+        (spaces.Tuple((NUMBERS, spaces.Discrete(3000))), "observation[1]", "3,000"),
+        (spaces.Discrete(4000), "observation", "4,000"),
+    ],
+    ids=["many choices", "one of many values", "alone"],
+)
+def test_a_member_whose_choices_are_most_of_the_numbers_is_named(
+    observations: gym.Space[Any], place: str, size: str
+) -> None:
+    (note,) = notes_on(observations=observations)
+    assert note.startswith(f"{size} numbers of these vectors are the choices of {place}, one for each value")
+
+
+@pytest.mark.parametrize(
+    "observations",
+    [
+        spaces.Dict({"few": spaces.Discrete(2999)}),
+        spaces.Dict({"part": spaces.Discrete(3000), "n": spaces.Box(0, 1, (3001,), np.float32)}),
+    ],
+    ids=["few", "less than half"],
+)
+def test_of_few_choices_or_a_small_part_nothing_is_said(observations: gym.Space[Any]) -> None:
+    assert notes_on(observations=observations) == []
+
+
+# -- actions that are refused
+
+
+def refused_by(error: Exception) -> list[EnvFailedError]:
+    """Return what is raised for an env's error by all that step environments."""
+    gym.register("ToldWalk-v0", cast("Any", lambda: Walk(refuses=error)))
+    rows = CheckedEnvs(make_vector_env("ToldWalk-v0", None, 2), "ToldWalk-v0")
+    rows.reset(seed=0)
+    packed = make_packed_envs("ToldWalk-v0", None, 2, kind="scalar")
+    packed.add("t0000", 0)
+    for _ in range(2):
+        rows.step(np.zeros(2, np.int64))
+        packed.step(np.zeros(2, np.int64))
+    with pytest.raises(EnvFailedError) as of_rllib:
+        rows.step(np.zeros(2, np.int64))
+    packed.step(np.zeros(2, np.int64))
+    of_packs = packed.errors["t0000"]
+    assert isinstance(of_packs, EnvFailedError)
+    policy = RandomPolicy(Walk().observation_space, Walk().action_space, env_id="ToldWalk-v0")
+    with pytest.raises(EnvFailedError) as of_episodes:
+        evaluate_policy(policy, env_id="ToldWalk-v0", seeds=[0])
+    return [of_rllib.value, of_packs, of_episodes.value]
+
+
+@pytest.mark.parametrize("said", ["Illegal move", "Operation 3 is not available", "valid machines are [1]"])
+def test_whoever_refuses_an_action_is_told_of_masks(said: str) -> None:
+    for failed in refused_by(ValueError(said)):
+        assert said in str(failed)
+        assert "a mask must say so: see 'Actions that are not always allowed'" in failed.hint
+
+
+def test_the_kind_of_an_error_counts_and_other_errors_do_not() -> None:
+    class InvalidActionError(Exception):
+        pass
+
+    assert all("a mask must say so" in failed.hint for failed in refused_by(InvalidActionError()))
+    gym.registry.pop("ToldWalk-v0")
+    assert not any("mask" in failed.hint for failed in refused_by(ZeroDivisionError("the cart left the track")))
+    # Outside of a step there is no action to refuse.
+    assert "mask" not in env_failed("It raised an error in reset()", ValueError("an invalid map")).hint
+
+
+def test_the_section_on_masks_is_called_so() -> None:
+    from pathlib import Path
+
+    guide = Path(__file__).parents[2] / "docs" / "guides" / "own-environment.md"
+    assert "\n## Actions that are not always allowed\n" in guide.read_text()
