@@ -28,8 +28,8 @@ from policies.envs.faults import close_env, hint_on, is_of_env, place_in_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import find_env, normalize_env_id
-from policies.envs.mask_hints import looks_like_mask
-from policies.envs.masks import ACTION_MASK, MasksActions, may_be_masked, seen_by_networks
+from policies.envs.mask_hints import UnusedMask, unused_mask
+from policies.envs.masks import MasksActions, may_be_masked, seen_by_networks
 from policies.envs.mujoco_warnings import say_each_once
 from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsError, is_taken, made_of
 from policies.envs.own_process import InOwnProcess
@@ -96,8 +96,8 @@ class EnvInfo:
     """The rule by which its episodes end by failure; None if they never do, or it is not known."""
     mask: str | None = None
     """Where its mask of actions comes from, in words; None if it has none, or none that is used."""
-    unused_mask: str | None = None
-    """The name of an info that looks like a mask of actions, which is not used."""
+    unused_mask: UnusedMask | None = None
+    """What looks like a mask of actions, which is not used."""
     is_flattened: bool = False
     """Whether its own observations are neither vectors nor images, and were made such (`policies.envs.flat`)."""
     unrepeated: str | None = None
@@ -147,11 +147,10 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         _check_observation_space(info)
         _check_keys(info)
         infos, unrepeated = check_first_step(env, info.env_id, constructor_args(info.env_args))
+        unused = None if mask is not None or wrappers.action_mask is not None else unused_mask(env, infos)
+        return replace(info, unused_mask=unused, unrepeated=unrepeated)
     finally:
         close_env(env)
-    if mask is None and wrappers.action_mask is None and looks_like_mask(infos.get(ACTION_MASK), info.action_space):
-        info = replace(info, unused_mask=ACTION_MASK)
-    return replace(info, unrepeated=unrepeated)
 
 
 def make_env(

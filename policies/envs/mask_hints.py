@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +15,17 @@ from policies.envs.masks import ACTION_MASK, METHOD, MaskedBox, Setting, member_
 from policies.envs.own_actions import sizes_of
 
 _LIKE_MASKS = re.compile("mask|legal|valid|allowed")
+_IS_CALLED_MASK = re.compile("(?=.*mask)(?=.*(?:action|move|legal|valid|allowed))")
+"""Of a method, whose name is all that is known of it."""
+
+
+class UnusedMask(NamedTuple):
+    """What looks like a mask of actions and is not used."""
+
+    place: str
+    """Where it is, in words, as `EnvInfo.mask` has it."""
+    setting: str
+    """The value of `env.action_mask`, as a sweep file has it, with which it is used."""
 
 
 def mask_hint(env: gym.Env[Any, Any], infos: Any) -> str:
@@ -47,10 +58,25 @@ def argument_hint(space: MaskedBox, setting: Setting) -> str:
     return f", and {called}" if setting is None else f', and mask=info["{name}"], or {called} if it is a method'
 
 
-def looks_like_mask(value: Any, action_space: gym.Space[Any]) -> bool:
-    """Whether something has a number for each action of a space."""
-    sizes = sizes_of(action_space)
-    return bool(sizes) and isinstance(value, np.ndarray) and value.size == sum(sizes)
+def unused_mask(env: gym.Env[Any, Any], infos: Mapping[str, Any]) -> UnusedMask | None:
+    """Return what looks like a mask of an environment's actions by its name and form; None: nothing does.
+
+    Args:
+        env: The environment, with its wrappers, of which none uses a mask.
+        infos: The infos of its reset.
+    """
+    if not (sizes := sizes_of(env.action_space)):
+        return None
+    value = infos.get(ACTION_MASK)
+    if isinstance(value, np.ndarray) and value.size == sum(sizes):
+        return UnusedMask(f"info[{ACTION_MASK!r}]", "true")
+    for name in filter(_LIKE_MASKS.search, _infos(env, infos)):
+        return UnusedMask(f"info[{name!r}]", name)
+    for name in filter(_LIKE_MASKS.search, _members(env)):
+        return UnusedMask(f"observation[{name!r}]", name)
+    for name in _methods(env, _IS_CALLED_MASK):
+        return UnusedMask(f"{name}()", name)
+    return None
 
 
 def _infos(env: gym.Env[Any, Any], infos: Any) -> Iterator[str]:
@@ -71,11 +97,11 @@ def _members(env: gym.Env[Any, Any]) -> Iterator[str]:
             yield name
 
 
-def _methods(env: gym.Env[Any, Any]) -> Iterator[str]:
+def _methods(env: gym.Env[Any, Any], like: re.Pattern[str] = _LIKE_MASKS) -> Iterator[str]:
     """Yield methods by their names alone: to call them might change the environment."""
     inner = env.unwrapped
     for name in dir(inner):
-        if _LIKE_MASKS.search(name) and not name.startswith("_"):
+        if like.search(name) and not name.startswith("_"):
             # A property is computed, and may fail in any way.
             with contextlib.suppress(Exception):
                 if needs_nothing(getattr(inner, name)):

@@ -21,6 +21,7 @@ from policies.acting.evaluate import Episodes
 from policies.acting.policy import Policy, RandomPolicy, WeightsPolicy
 from policies.envs.failures import FailureRule
 from policies.envs.make import EnvInfo
+from policies.envs.mask_hints import UnusedMask
 from policies.envs.spaces import space_from_description
 from policies.errors import EnvError, TuneJobsError
 from policies.files import write_atomic, write_plain
@@ -72,6 +73,7 @@ def check_env(
     failure = told["failure"]
     told |= {name: space_from_description(told[name]) for name in ("observation_space", "action_space")}
     told |= {"env_args": args, "failure": None if failure is None else FailureRule(**failure)}
+    told["unused_mask"] = None if told["unused_mask"] is None else UnusedMask(*told["unused_mask"])
     return EnvInfo(**told)
 
 

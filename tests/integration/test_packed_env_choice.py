@@ -7,6 +7,7 @@ import pytest
 from policy_factory import register_test_envs
 from test_packed_envs import own_modules
 
+from policies.envs.make import check_env
 from policies.errors import EnvError
 from policies.guard import guarded
 from policies.packed.envs.make import StepTime, check_seedable, choose_kind, measure_step
@@ -93,3 +94,8 @@ def test_the_guard_tells_of_what_cannot_be_seeded_too() -> None:
     assert re.fullmatch(
         r"\[0\] is -?[\d.]+ and then -?[\d.]+", present(guarded.check_env("odd_envs:Unseedable", None).unrepeated)
     )
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Taxi-v3", "policy_factory:Walk"])
+def test_the_guard_tells_what_is_told_without_it(env_id: str) -> None:
+    assert guarded.check_env(env_id, None) == check_env(env_id, None)

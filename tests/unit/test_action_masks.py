@@ -21,6 +21,7 @@ from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.envs.flat import FlatBox
 from policies.envs.make import EnvInfo, check_env, make_env, make_vector_env
+from policies.envs.mask_hints import UnusedMask
 from policies.envs.masks import FORBIDDEN, MaskedBox
 from policies.envs.spaces import describe_space, space_from_description
 from policies.errors import CheckpointError, EnvError, ObservationError
@@ -139,7 +140,7 @@ def test_frames_are_stacked_behind_the_newest_mask() -> None:
 
 def test_an_info_that_looks_like_a_mask_is_told_and_not_used() -> None:
     info = check_env("Taxi-v3", None, "dqn")
-    assert (info.mask, info.unused_mask) == (None, "action_mask")
+    assert (info.mask, info.unused_mask) == (None, UnusedMask("info['action_mask']", "true"))
     info = check_env("Taxi-v3", {"action_mask": "action_mask"}, "dqn")
     assert (info.mask, info.unused_mask) == ("info['action_mask']", None)
     assert info.observation_space.shape == (506,)

@@ -108,6 +108,91 @@ def test_an_env_that_can_be_reset_only_once_is_left_to_its_trials(monkeypatch: p
     assert notes_on() == []
 
 
+# -- masks that are not used
+
+
+class Masked(Walk):
+    """Says which actions are allowed in one way or another, of which none is used without a word."""
+
+    def __init__(self, infos: dict[str, Any] | None = None, **methods: Any) -> None:
+        super().__init__(methods.pop("observations", NUMBERS))
+        self.infos = infos or {}
+        for name, method in methods.items():
+            setattr(self, name, method)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return super().reset(seed=seed)[0], self.infos
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return *super().step(action)[:4], self.infos
+
+
+def masked(**args: Any) -> list[str]:
+    gym.register("ToldWalk-v0", cast("Any", lambda: Masked(**args)))
+    env_args = args.pop("env_args", None)
+    spec = load_spec({"env": "ToldWalk-v0", "algorithm": "ppo"})
+    return [note for note in env_notes(spec, check_env("ToldWalk-v0", env_args)) if "are made vectors" not in note]
+
+
+MASK = np.array([1, 0], np.int8)
+LEGAL = spaces.Dict({"legal": spaces.MultiBinary(2), "n": NUMBERS})
+
+
+@pytest.mark.parametrize(
+    ("args", "place", "setting"),
+    [
+        ({"infos": {"action_mask": MASK}}, "info['action_mask']", "true"),
+        ({"infos": {"board": MASK, "legal_moves": [True, False]}}, "info['legal_moves']", "legal_moves"),
+        ({"observations": LEGAL}, "observation['legal']", "legal"),
+        ({"valid_action_mask": lambda: MASK}, "valid_action_mask()", "valid_action_mask"),
+        ({"get_legal_mask": lambda: MASK}, "get_legal_mask()", "get_legal_mask"),
+    ],
+    ids=["info", "info of another name", "member", "method", "another method"],
+)
+def test_what_looks_like_a_mask_is_told_with_the_setting_that_uses_it(
+    args: dict[str, Any], place: str, setting: str
+) -> None:
+    told = masked(**args)
+    (note,) = told
+    assert note == (
+        f"ToldWalk-v0 gives {place}, which seems to say which actions are allowed, and which is not used: "
+        f"env.action_mask: {setting} uses it."
+    )
+    gym.registry.pop("ToldWalk-v0")
+    value = True if setting == "true" else setting
+    gym.register("ToldWalk-v0", cast("Any", lambda: Masked(**args)))
+    info = check_env("ToldWalk-v0", {"action_mask": value})
+    assert (info.mask, info.unused_mask) == (place, None)
+    assert check_env("ToldWalk-v0", {"action_mask": False}).unused_mask is None
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        {"infos": {"legal_moves": [0, 1, 1], "valid": True, "mask": "none", "moves": MASK}},
+        {"observations": spaces.Dict({"legal": spaces.MultiBinary(3), "n": NUMBERS})},
+        {"observations": spaces.Dict({"left": spaces.MultiBinary(2), "n": NUMBERS})},
+        {"action_mask_of": lambda state: MASK, "mask": lambda: MASK, "valid_actions": lambda: [0]},
+        {"valid_action_mask": MASK},
+    ],
+    ids=["infos", "another length", "another name", "methods of other names or with arguments", "no method"],
+)
+def test_what_only_resembles_a_mask_is_not_told(args: dict[str, Any]) -> None:
+    assert masked(**args) == []
+
+
+def test_no_property_is_read_that_is_not_called_as_a_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+
+    def reading(name: str) -> property:
+        return property(lambda _: read.append(name))
+
+    for name in ("is_valid", "legal", "legal_mask"):
+        monkeypatch.setattr(Masked, name, reading(name), raising=False)
+    assert masked() == []
+    assert read == ["legal_mask"]
+
+
 # -- choices by the thousand
 
 
@@ -146,6 +231,13 @@ def test_of_few_choices_or_a_small_part_nothing_is_said(observations: gym.Space[
 # -- actions that are refused
 
 
+class Forgetful(Masked):
+    """Says in the first observation alone which actions are allowed."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return *super().step(action)[:4], {}
+
+
 def refused_by(error: Exception) -> list[EnvFailedError]:
     """Return what is raised for an env's error by all that step environments."""
     gym.register("ToldWalk-v0", cast("Any", lambda: Walk(refuses=error)))
@@ -181,6 +273,12 @@ def test_the_kind_of_an_error_counts_and_other_errors_do_not() -> None:
     assert all("a mask must say so" in failed.hint for failed in refused_by(InvalidActionError()))
     gym.registry.pop("ToldWalk-v0")
     assert not any("mask" in failed.hint for failed in refused_by(ZeroDivisionError("the cart left the track")))
+    gym.registry.pop("ToldWalk-v0")
+    # What this package raises, as of a mask that is not there, says itself what is wrong.
+    gym.register("ToldWalk-v0", cast("Any", lambda: Forgetful({"legal": MASK})))
+    with pytest.raises(EnvFailedError, match=r"there is no info\['legal'\] after env step 1") as caught:
+        check_env("ToldWalk-v0", {"action_mask": "legal"})
+    assert "a mask must say so" not in caught.value.hint
     # Outside of a step there is no action to refuse.
     assert "mask" not in env_failed("It raised an error in reset()", ValueError("an invalid map")).hint
 

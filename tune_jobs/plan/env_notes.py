@@ -61,8 +61,8 @@ def _on_actions(env: EnvInfo) -> Iterator[str]:
         )
     elif env.unused_mask is not None:
         yield (
-            f"{env.env_id} gives info[{env.unused_mask!r}], which seems to say which actions are allowed, and which is "
-            "not used: env.action_mask: true uses it."
+            f"{env.env_id} gives {env.unused_mask.place}, which seems to say which actions are allowed, and which is "
+            f"not used: env.action_mask: {env.unused_mask.setting} uses it."
         )
 
 
