@@ -28,9 +28,10 @@ _ONE_ALONE = re.compile("(?i)(per|same|each|one|single) process")
 _PYGAME_IS_CLOSED = re.compile("display Surface quit|(?:video system|font|mixer) not initialized")
 """What pygame says once an environment of the process has called `pygame.quit()`, which closes what all draw on."""
 _OLDER_NUMPY = re.compile(
-    "module 'numpy' has no attribute|removed in the NumPy|only 0-dimensional arrays can be converted"
+    r"module 'numpy' has no attribute|removed in the NumPy|only 0-dimensional arrays can be converted"
+    r"|cannot import name '\w+' from 'numpy'|numpy\.dtype size changed|numpy\.core\.multiarray failed to import"
 )
-"""What NumPy says to code that was written for a version before it."""
+"""What NumPy says to code that was written, or compiled, for a version before it."""
 _NO_MODULE = re.compile(r"No module named '?(\w+)")
 _INSTALLED_BY = {
     "Box2D": "Box2D==2.3.10",
@@ -162,11 +163,11 @@ def known_hint(error: BaseException) -> str | None:
         return hint
     if _ONE_ALONE.search(said):
         return "If a process can hold one such environment only, give each a process of its own: env.own_process: true."
-    if (hint := name_hint(error)) is not None:
+    if (hint := name_hint(error) or numpy_hint(error)) is not None:
         return hint
     if isinstance(error, ImportError | DependencyNotInstalled):
         return "Install the package that the message names, on every machine that runs trials."
-    return numpy_hint(error)
+    return None
 
 
 def name_hint(error: BaseException) -> str | None:

@@ -69,6 +69,10 @@ def test_an_envs_error_can_be_told(error: ValueError | MuteError | WordlessError
             "an older NumPy",
         ),
         (TypeError("only 0-dimensional arrays can be converted to Python scalars"), "an older NumPy"),
+        (ImportError("cannot import name 'Inf' from 'numpy' (numpy/__init__.py)"), "an older NumPy"),
+        (ImportError("numpy.core.multiarray failed to import"), "an older NumPy"),
+        (ValueError("numpy.dtype size changed, may indicate binary incompatibility"), "an older NumPy"),
+        (ImportError("cannot import name 'inf' from 'numpyro'"), "Install the package"),
         (ImportError("libfoo is not there"), "Install the package"),
         (TypeError("Drive.reset() got an unexpected keyword argument 'options'"), "def reset(self, *, seed=None, "),
         (TypeError("reset() got an unexpected keyword argument 'seed'"), "def reset(self, *, seed=None, "),
@@ -90,9 +94,12 @@ def test_what_to_do_about_an_error_of_an_env_is_known_by_its_words(error: Except
 def test_numpy_says_what_the_hint_goes_by() -> None:
     from policies.envs.faults import numpy_hint
 
-    said = caught(lambda: np.no_such_type)  # type: ignore[attr-defined]
-    assert said is not None
-    assert f"older than {np.__version__}" in str(numpy_hint(said))
+    def take() -> None:
+        from numpy import no_such_type  # type: ignore[attr-defined] # noqa: F401
+
+    for said in (caught(lambda: np.no_such_type), caught(take)):  # type: ignore[attr-defined]
+        assert said is not None
+        assert f"older than {np.__version__}" in str(numpy_hint(said))
 
 
 def caught(raise_it: Callable[[], Any]) -> Exception | None:
