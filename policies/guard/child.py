@@ -104,7 +104,7 @@ def _answer(asked: Mapping[str, Any], told: calls.Page) -> dict[str, Any]:
 
 def _see(asked: Mapping[str, Any]) -> None:
     """Give this process the parent's log, folder, import path and allowed modules."""
-    print_to(asked["log"])
+    print_to(asked.get("log"))
     env_modules.allow_modules(asked["modules"])
     if os.getcwd() != asked["folders"][0]:  # noqa: PTH109
         os.chdir(asked["folders"][0])
