@@ -129,8 +129,8 @@ def env_failed(
     if (place := place_in_env(error)) is not None:
         detail += f" ({place})" if detail else f"at {place}"
     # What this package itself raises says what is wrong with a mask.
-    is_its_own = not type(error).__module__.startswith("policies.")
-    if in_step and is_its_own and _REFUSES.search(f"{type(error).__name__}: {said_by(error)}"):
+    is_of_ours = type(error).__module__.startswith("policies.")
+    if in_step and not is_of_ours and _REFUSES.search(f"{type(error).__name__}: {said_by(error)}"):
         hint = f"{hint} {_IF_REFUSED}"
     return EnvFailedError(f"{what}: {type(error).__name__}{f': {detail}' if detail else ''}.", hint_on(error, hint))
 

@@ -7,9 +7,7 @@ id such as `module:Env-v0` names, allowed or not.
 from __future__ import annotations
 
 import contextlib
-import copy
-import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from importlib.util import find_spec
 from inspect import isfunction
@@ -79,7 +77,13 @@ def find_env(env_id: str) -> tuple[str, EnvSpec]:
         if is_atari_id(env_id) and not any(map(is_atari_id, gym.registry)):
             guess, hint = " It is a game of the Arcade Learning Environment, which is not installed.", INSTALL
         raise EnvError(f"No environment {env_id!r} is registered with Gymnasium.{guess}{reasons}", hint)
-    return found, _entry(found)
+    return found, gym.registry[found]
+
+
+def as_creator(maker: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what Gymnasium takes for a class or function that makes environments."""
+    # Gymnasium reads the class's metadata, which of a Wrapper is a property.
+    return partial(maker) if isinstance(getattr(maker, "metadata", None), property) else maker
 
 
 def module_of(env_id: str) -> str | None:
@@ -99,9 +103,9 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
     is_class = isinstance(thing, type) and issubclass(thing, gym.Env)
     # A class of one's own may be called as an environment of another package is, without its version.
     if found is not None and (not is_class or _is_registered_by(found, module_name, thing.__module__)):
-        return f"{module_name}:{found}", _entry(found)
+        return f"{module_name}:{found}", gym.registry[found]
     if is_class:
-        return env_id, EnvSpec(env_id, entry_point=_creator(thing))
+        return env_id, EnvSpec(env_id, entry_point=cast("EnvCreator", as_creator(thing)))
     classes = [
         name
         for name, value in vars(module).items()
@@ -113,26 +117,6 @@ def _find_in_module(env_id: str) -> tuple[str, EnvSpec]:
         _if_it_registers(module)
         or "Correct the name after the colon, or call gymnasium.register in the module when it is imported.",
     )
-
-
-def _entry(env_id: str) -> EnvSpec:
-    """Return a registered id's entry, which of a gymnasium.Wrapper is one that Gymnasium makes."""
-    spec = gym.registry[env_id]
-    maker = spec.entry_point
-    if isinstance(maker, str):
-        # One that is not imported yet is no class of a module that was named.
-        module, _, name = maker.partition(":")
-        maker = getattr(sys.modules.get(module), name, None)
-    if not isinstance(maker, type) or not issubclass(maker, gym.Wrapper):
-        return spec
-    changed = copy.copy(spec)
-    changed.entry_point = _creator(maker)
-    return changed
-
-
-def _creator(kind: type[gym.Env[Any, Any]]) -> EnvCreator:
-    # Gymnasium reads the class's metadata, which of a Wrapper is a property.
-    return cast("EnvCreator", partial(kind) if isinstance(kind.metadata, property) else kind)
 
 
 def _if_it_registers(module: ModuleType) -> str:

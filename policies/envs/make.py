@@ -27,7 +27,7 @@ from policies.envs.failures import FailureRule, check_failure_penalty, failure_r
 from policies.envs.faults import close_env, hint_on, is_of_env, place_in_env
 from policies.envs.first_step import check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
-from policies.envs.ids import find_env, normalize_env_id
+from policies.envs.ids import as_creator, find_env, normalize_env_id
 from policies.envs.mask_hints import UnusedMask, unused_mask
 from policies.envs.masks import MasksActions, may_be_masked, seen_by_networks
 from policies.envs.mujoco_warnings import say_each_once
@@ -255,7 +255,8 @@ def _made(
     creator = _creator(env_id, spec)
     if wrappers.atari is not None:
         kwargs = wrappers.atari.game_args(env_id, creator, kwargs)
-    made = replace(spec, entry_point=partial(InOwnProcess, env_id)) if wrappers.own_process else spec
+    entry = partial(InOwnProcess, env_id) if wrappers.own_process else creator
+    made = replace(spec, entry_point=entry) if isinstance(entry, partial) else spec
     return without_window(partial(make, made), kwargs, creator, spec.kwargs)
 
 
@@ -294,8 +295,8 @@ def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
             creator: Callable[..., Any] = load_env_creator(spec.entry_point)
         except BaseException as error:  # importing an env's module may raise anything
             raise _cannot_make(env_id, {}, error) from error
-        return creator
-    return spec.entry_point
+        return as_creator(creator)
+    return None if spec.entry_point is None else as_creator(spec.entry_point)
 
 
 def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:

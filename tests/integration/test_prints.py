@@ -90,18 +90,26 @@ def test_the_children_of_parallel_episodes_print_there_too(said_by: Callable[[st
     assert (tmp_path / "a.log").read_text().count("by the system") >= 2
 
 
+FINISHING = (
+    "from pathlib import Path\n"
+    "from tune_jobs.store.sweep_store import SweepStore\n"
+    "from tune_jobs.sweeps.finishing import _Finish\n"
+    "from policies.guard import guarded\n"
+    "store = SweepStore(Path('mine'))\n"
+    "store.create()\n"
+    "{before}\n"
+    "with _Finish(store, 'none', keep=False)._working('choosing') as say:\n"
+    "    guarded.check_env('loud_envs:Loud', {{}})\n"
+)
+
+
 def test_while_a_sweep_is_finished_its_log_has_it(said_by: Callable[[str], str], tmp_path: Path) -> None:
-    said = said_by(
-        "from pathlib import Path\n"
-        "import tune_jobs\n"
-        "from tune_jobs.spec.file import load_spec\n"
-        "from tune_jobs.store.sweep_store import SweepStore\n"
-        "from tune_jobs.sweeps.finishing import _Finish\n"
-        "from policies.guard import guarded\n"
-        "store = SweepStore(Path('mine'))\n"
-        "store.create()\n"
-        "with _Finish(store, 'none', keep=False)._working('choosing') as say:\n"
-        "    guarded.check_env('loud_envs:Loud', {})\n"
-    )
+    said = said_by(FINISHING.format(before=""))
     assert "by the system" not in said
     assert all(what in (tmp_path / "mine" / "driver.log").read_text() for what in SAID)
+
+
+def test_a_sweep_whose_log_is_a_link_is_finished_all_the_same(said_by: Callable[[str], str], tmp_path: Path) -> None:
+    said = said_by(FINISHING.format(before="Path('mine/driver.log').symlink_to('elsewhere')"))
+    assert all(what in said for what in SAID)
+    assert not (tmp_path / "mine" / "elsewhere").exists()

@@ -180,9 +180,11 @@ def test_a_wrapper_of_an_allowed_module_is_an_env_class_too(own: Path) -> None:
         make_env("own_walks:Limited", {"lenght": 2})
 
 
-@pytest.mark.parametrize("entry", ["Limited", "'own_wrapped:Limited'"])
+@pytest.mark.parametrize("entry", ["Limited", "'own_wrapped:Limited'", "'own_apart:Limited'"])
 def test_a_wrapper_that_a_module_registers_is_an_env_too(own: Path, entry: str) -> None:
     """Gymnasium refuses to make it: "Expect the environment metadata to be dict, actual type: <class 'module'>"."""
+    # As of a package whose modules are imported only when an environment is made.
+    (own / "own_apart.py").write_text("from own_walks import Limited\n")
     (own / "own_wrapped.py").write_text(
         f"import gymnasium as gym\nfrom own_walks import Limited\n"
         f"gym.register('OwnWalkWrapped-v0', {entry}, max_episode_steps=5, kwargs={{'length': 7}})\n"
@@ -193,6 +195,9 @@ def test_a_wrapper_that_a_module_registers_is_an_env_too(own: Path, entry: str) 
     env = make_env("own_wrapped:OwnWalkWrapped-v0")
     env.reset(seed=0)
     assert [env.step(0)[3] for _ in range(2)] == [False, True]
+    drawn: Any = make_env("own_wrapped:OwnWalkWrapped-v0", render_mode="rgb_array")
+    assert drawn.get_wrapper_attr("given") == "rgb_array"
+    assert len(make_vector_env("own_wrapped:OwnWalkWrapped-v0", {}, 2).unwrapped.envs) == 2
     # The entry itself stays as it is.
     assert not callable(getattr(gym.registry["OwnWalkWrapped-v0"].entry_point, "func", None))
 

@@ -96,6 +96,22 @@ def test_nothing_is_said_of_what_is_rounded_otherwise_or_of_another_mask() -> No
     assert [note for note in told if "reset twice" in note] == []
 
 
+def test_images_and_what_changes_its_shape_are_told_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def image(self: Walk) -> Any:
+        return np.full((4, 5, 3), 7 + (self.resets > 1), np.uint8)
+
+    def other_shape(self: Walk) -> Any:
+        return np.zeros(3 - (self.resets > 1), np.float32)
+
+    monkeypatch.setattr(Walk, "seen", image)
+    (note,) = notes_on(observations=spaces.Box(0, 255, (4, 5, 3), np.uint8))
+    assert "differs: [0, 0, 0] is 7 and then 8." in note
+    gym.registry.pop("ToldWalk-v0")
+    monkeypatch.setattr(Walk, "seen", other_shape)
+    (note,) = notes_on()
+    assert "differs: it is of shape (3,) and then (2,)." in note
+
+
 def test_an_env_that_can_be_reset_only_once_is_left_to_its_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = Walk.seen
 

@@ -120,8 +120,11 @@ class _Finish:
         from policies.guard.guarded import printing_to
         from tune_jobs.sweeps.live_view import working
 
-        with printing_to(self._store.driver_log), working(self._store.name, doing, self._progress) as say:
-            yield say
+        with contextlib.ExitStack() as stack:
+            # A log that is a link, say, is no reason to make nothing: what environments print is seen then.
+            with contextlib.suppress(TuneJobsError):
+                stack.enter_context(printing_to(self._store.driver_log))
+            yield stack.enter_context(working(self._store.name, doing, self._progress))
 
     def _attempt(self, what: str, doing: str, make: Callable[[Callable[[str], None]], dict[str, Path]]) -> None:
         if self._asked_to_stop():
