@@ -24,7 +24,7 @@ from analysis.statistics import mean_with_ci, paired_difference
 from analysis.wording import counted, return_text, shown_path
 from policies import random_streams
 from policies.acting.movies import still_of
-from policies.envs.masks import ACTION_MASK, METHOD
+from policies.envs.mask_settings import ACTION_MASK, METHOD, names_in
 from policies.errors import CheckpointError, NotFoundError
 from policies.portable.file import read_policy
 
@@ -171,7 +171,7 @@ def acting_code(folder: Path) -> str:
     setting = policy.env_args.get(ACTION_MASK)
     if setting is None:
         return f"action = policy.act(observation, mask={_called(METHOD)})"
-    name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
+    name, method = names_in(setting)
     return f"action = policy.act(observation, mask=info[{json.dumps(name)}])  # or {_called(method)}, if there is one"
 
 

@@ -30,7 +30,8 @@ from policies.envs.action_bounds import ToBounds
 from policies.envs.flat import FlatBox
 from policies.envs.make import check_env
 from policies.envs.mask_hints import argument_hint
-from policies.envs.masks import ACTION_MASK, FORBIDDEN, MaskedBox, draw_allowed, num_masked
+from policies.envs.mask_settings import ACTION_MASK
+from policies.envs.masks import FORBIDDEN, MaskedBox, draw_allowed, num_masked
 from policies.envs.own_actions import Choices, is_made, own_actions
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
@@ -81,9 +82,9 @@ class Policy(ABC):
         Args:
             observations: Shape: that of one observation, or (num, *that shape). Where observations were made vectors
                 (`policies.envs.flat`), also what the environment itself gives: a dict, a tuple, a choice.
-            mask: Which actions are allowed: zeros and ones, one for each value of each choice, or a batch of such. It
-                is needed where the environment says it in its infos or by a method; one that is a member of the
-                observations is read there.
+            mask: Which actions are allowed: zeros and ones, one for each value of each choice, or a batch of such; or
+                lists of the actions that are allowed, if that is what it was trained with. It is needed where the
+                environment says it in its infos or by a method; one that is a member of the observations is read there.
 
         Returns:
             For one observation, what `env.step` takes: an int (Discrete), an array (Box, MultiDiscrete, MultiBinary),

@@ -19,7 +19,8 @@ from policies.envs.checked import is_sound, reward_as_number
 from policies.envs.faults import env_failed
 from policies.envs.flat import FlatBox, needs_flattening
 from policies.envs.mask_hints import mask_hint
-from policies.envs.masks import ACTION_MASK, NoMaskError, num_masked, sample, seen_by_networks
+from policies.envs.mask_settings import ACTION_MASK
+from policies.envs.masks import NoMaskError, num_masked, sample, seen_by_networks
 from policies.envs.own_actions import is_made
 from policies.errors import EnvError, shortened
 

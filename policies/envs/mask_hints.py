@@ -10,13 +10,18 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from policies.envs.mask_values import checked_mask
-from policies.envs.masks import ACTION_MASK, METHOD, MaskedBox, Setting, member_problem, needs_nothing
+from policies.envs.mask_settings import ACTION_MASK, ACTIONS, Setting, names_in
+from policies.envs.mask_values import checked_mask, listed_mask
+from policies.envs.masks import MaskedBox, member_problem, needs_nothing
 from policies.envs.own_actions import sizes_of
 
 _LIKE_MASKS = re.compile("mask|legal|valid|allowed")
 _IS_CALLED_MASK = re.compile("(?=.*mask)(?=.*(?:action|move|legal|valid|allowed))")
 """Of a method, whose name is all that is known of it."""
+_LIKE_LISTS = re.compile(
+    "(?=.*(?:action|move))(?:(?<!in)(?:valid|feasible|admissible)|(?<!il)legal|(?<!dis)allowed|(?<!un)available"
+    "|(?<!im)possible)"
+)
 
 
 class UnusedMask(NamedTuple):
@@ -35,7 +40,7 @@ def mask_hint(env: gym.Env[Any, Any], infos: Any) -> str:
         env: The environment, with its wrappers.
         infos: The infos of its reset.
     """
-    names = [*_infos(env, infos), *_members(env), *_methods(env)]
+    names = [*_infos(env, infos), *_lists(env, infos).values(), *_members(env), *_methods(env)]
     if not names:
         return f"Set env.{ACTION_MASK}: false, or leave it out: nothing of the env looks like a mask."
     return f"Write env.{ACTION_MASK}: {' or '.join(dict.fromkeys(names))}; or false, if that is no mask."
@@ -52,7 +57,7 @@ def argument_hint(space: MaskedBox, setting: Setting) -> str:
         return ""
     if space.original is None:
         return ", and the newest mask of the environment as mask="
-    name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
+    name, method = names_in(setting)
     called = f'mask=env.get_wrapper_attr("{method}")()'
     # Without a setting, a mask that is no member is a method.
     return f", and {called}" if setting is None else f', and mask=info["{name}"], or {called} if it is a method'
@@ -65,18 +70,22 @@ def unused_mask(env: gym.Env[Any, Any], infos: Mapping[str, Any]) -> UnusedMask 
         env: The environment, with its wrappers, of which none uses a mask.
         infos: The infos of its reset.
     """
-    if not (sizes := sizes_of(env.action_space)):
-        return None
+    sizes = sizes_of(env.action_space)
+    return next(_like_masks(env, infos, sum(sizes)), None) if sizes else None
+
+
+def _like_masks(env: gym.Env[Any, Any], infos: Mapping[str, Any], num_masked: int) -> Iterator[UnusedMask]:
     value = infos.get(ACTION_MASK)
-    if isinstance(value, np.ndarray) and value.size == sum(sizes):
-        return UnusedMask(f"info[{ACTION_MASK!r}]", "true")
+    if isinstance(value, np.ndarray) and value.size == num_masked:
+        yield UnusedMask(f"info[{ACTION_MASK!r}]", "true")
     for name in filter(_LIKE_MASKS.search, _infos(env, infos)):
-        return UnusedMask(f"info[{name!r}]", name)
+        yield UnusedMask(f"info[{name!r}]", name)
+    for name, setting in _lists(env, infos).items():
+        yield UnusedMask(f"info[{name!r}]", setting)
     for name in filter(_LIKE_MASKS.search, _members(env)):
-        return UnusedMask(f"observation[{name!r}]", name)
+        yield UnusedMask(f"observation[{name!r}]", name)
     for name in _methods(env, _IS_CALLED_MASK):
-        return UnusedMask(f"{name}()", name)
-    return None
+        yield UnusedMask(f"{name}()", name)
 
 
 def _infos(env: gym.Env[Any, Any], infos: Any) -> Iterator[str]:
@@ -85,6 +94,22 @@ def _infos(env: gym.Env[Any, Any], infos: Any) -> Iterator[str]:
         with contextlib.suppress(Exception):
             checked_mask(value, sizes_of(env.action_space))
             yield str(name)
+
+
+def _lists(env: gym.Env[Any, Any], infos: Any) -> dict[str, str]:
+    """Return the infos that seem to list the actions that are allowed, each with the setting that uses it."""
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Discrete) or not isinstance(infos, Mapping):
+        return {}
+    found = {}
+    for name, value in infos.items():
+        # What an info holds may be anything, and fail in any way.
+        with contextlib.suppress(Exception):
+            # A number that is there twice may be a part of anything.
+            if _LIKE_LISTS.search(name) and len(set(value)) == len(value):
+                listed_mask(value, int(space.n), int(space.start))
+                found[name] = f"{{{ACTIONS}: {name}}}"
+    return found
 
 
 def _members(env: gym.Env[Any, Any]) -> Iterator[str]:

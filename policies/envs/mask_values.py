@@ -48,13 +48,46 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
     return checked
 
 
+def listed_mask(actions: Any, size: int, first: int) -> NDArray[np.float32]:
+    """Return the mask for a list of the actions that are allowed.
+
+    Args:
+        actions: Whole numbers in any order: a list, a tuple, a set, an array, or the keys of a mapping.
+        size: How many actions there are.
+        first: The number of the first.
+
+    Raises:
+        MaskProblemError: It is something else, or empty.
+    """
+    try:
+        numbers = np.asarray(list(actions))
+    except (TypeError, ValueError):  # nothing to go through, or members of several shapes
+        numbers = np.empty((0, 0))
+    if numbers.shape == (0,):
+        raise MaskProblemError("which forbids every action")
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
+        raise MaskProblemError(f"not a list of actions, which are numbers from {first} to {first + size - 1}")
+    outside = numbers[(numbers < first) | (numbers >= first + size)]
+    if outside.size:
+        raise MaskProblemError(f"and {outside[0]} is no action: they are numbers from {first} to {first + size - 1}")
+    listed = set(numbers.tolist())
+    if numbers.size == size > len(listed) and listed <= {0, 1}:
+        raise MaskProblemError("which are zeros and ones and not a list of actions: give its name alone for a mask")
+    mask = np.zeros(size, np.float32)
+    mask[numbers - first] = 1
+    return mask
+
+
 def _if_numbers(values: NDArray[Any], sizes: tuple[int, ...]) -> str:
     """Return what to do if what was given for a mask are the actions allowed, themselves; "": they are not."""
     if len(sizes) > 1 or values.dtype.kind not in "iu" or len(set(values.tolist())) != values.size:
         return ""
     if not ((values >= 0) & (values < sizes[0])).all():
         return ""
-    return "; if these are the actions that are allowed, let the environment or a wrapper make zeros and ones of them"
+    return (
+        "; if these are the actions that are allowed, write action_mask: {actions: ...} with its name, or make zeros "
+        "and ones of them"
+    )
 
 
 @functools.cache

@@ -5,7 +5,8 @@ travels as the first numbers of what is observed (`MaskedBox`), so that it is wh
 replay memories, checkpoints' spaces, evaluations and videos. Networks see what is behind it.
 
 An environment says its mask in one of three places, all known by one name: as a member of its Dict observations, by a
-method, as Stable-Baselines3's contributions have it (`action_masks()`), or in the infos of reset and step.
+method, as Stable-Baselines3's contributions have it (`action_masks()`), or in the infos of reset and step. A method or
+an info may also list the actions that are allowed, of which a mask is made.
 """
 
 from __future__ import annotations
@@ -21,19 +22,15 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from policies.envs.flat import FlatBox, needs_flattening
-from policies.envs.mask_values import MaskProblemError, checked_mask, is_one_mask
+from policies.envs.mask_settings import ACTION_MASK, METHOD, Setting, lists_actions, names_in
+from policies.envs.mask_values import MaskProblemError, checked_mask, is_one_mask, listed_mask
 from policies.envs.own_actions import sizes_of
 from policies.errors import EnvError, shortened
 
-ACTION_MASK = "action_mask"
-"""The key of an environment's arguments that names its mask, and the name of a mask that needs not be named."""
-METHOD = "action_masks"
-"""The method that needs not be named."""
 FORBIDDEN = float(np.finfo(np.float32).min)
 """The logit, or the Q-value, of what is not allowed: as good as minus infinity, but no NaN comes of it."""
 
 Source = Literal["observation", "method", "info"]
-Setting = str | bool | None
 
 
 class MaskedBox(gym.spaces.Box):
@@ -44,9 +41,11 @@ class MaskedBox(gym.spaces.Box):
         sizes: How many values each choice of an action has.
         original: The environment's own space; None: that is not known, as of stacked frames.
         key: The member of the environment's Dict that is the mask; None: it does not come with the observation.
+        lists_from: The number of the first action, if the environment lists those that are allowed; None: it gives
+            zeros and ones.
 
     Attributes:
-        seen, sizes, original, key: The same.
+        seen, sizes, original, key, lists_from: The same.
         num_masked: How many numbers a mask has.
     """
 
@@ -57,8 +56,9 @@ class MaskedBox(gym.spaces.Box):
         *,
         original: gym.Space[Any] | None = None,
         key: str | None = None,
+        lists_from: int | None = None,
     ) -> None:
-        self.seen, self.sizes, self.original, self.key = seen, sizes, original, key
+        self.seen, self.sizes, self.original, self.key, self.lists_from = seen, sizes, original, key, lists_from
         self.num_masked = sum(sizes)
         mask = np.ones(self.num_masked, np.float32)
         with np.errstate(over="ignore"):
@@ -66,7 +66,9 @@ class MaskedBox(gym.spaces.Box):
         super().__init__(np.concatenate([0 * mask, low]), np.concatenate([mask, high]), dtype=np.float32)
 
     @classmethod
-    def of(cls, original: gym.Space[Any], sizes: tuple[int, ...], key: str | None) -> MaskedBox:
+    def of(
+        cls, original: gym.Space[Any], sizes: tuple[int, ...], key: str | None, lists_from: int | None = None
+    ) -> MaskedBox:
         """Return the space for an environment's own.
 
         Raises:
@@ -80,7 +82,7 @@ class MaskedBox(gym.spaces.Box):
         assert isinstance(made, gym.spaces.Box)
         if len(made.shape) != 1:
             raise ValueError(f"images of shape {made.shape}")
-        return cls(made, sizes, original=original, key=key)
+        return cls(made, sizes, original=original, key=key, lists_from=lists_from)
 
     def joined(self, observation: Any, mask: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the vector for one observation of the environment's own and its mask.
@@ -144,9 +146,19 @@ class MaskedBox(gym.spaces.Box):
 
     def _checked(self, mask: Any) -> NDArray[np.float32]:
         try:
-            return checked_mask(mask, self.sizes)
+            return self.mask_of(mask)
         except MaskProblemError as error:
             raise ValueError(f"{shortened(mask)} is the mask, {error}") from None
+
+    def mask_of(self, given: Any) -> NDArray[np.float32]:
+        """Return the mask for what an environment gives: zeros and ones, or a list of the actions that are allowed.
+
+        Raises:
+            MaskProblemError: It is something else, or a choice has no value that is allowed.
+        """
+        if self.lists_from is None:
+            return checked_mask(given, self.sizes)
+        return listed_mask(given, self.sizes[0], self.lists_from)
 
     @override
     def __repr__(self) -> str:
@@ -230,10 +242,12 @@ class MasksActions(gym.Wrapper[Any, Any, Any, Any]):
                 problem = f"there is no {self.place} {when}"
                 if self.source == "observation":
                     raise ValueError(f"{problem}; there is {known}") from None
-                problem += ", nor such a member of the observations, nor a method"
+                if self.space.lists_from is None:
+                    problem += ", nor such a member of the observations"
+                problem += ", nor a method"
                 raise NoMaskError(f"{problem}; there is {known or 'nothing'}", holder) from None
         try:
-            return checked_mask(value, self.space.sizes)
+            return self.space.mask_of(value)
         except MaskProblemError as error:
             if is_over:
                 return self._everything
@@ -278,8 +292,9 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
 
     Args:
         env: Takes the actions that policies give.
-        setting: The name of the mask; True: `action_mask`, or a method `action_masks`; None: the same, but not if it
-            were an info; False: what there may be is no mask.
+        setting: The name of the mask, or of a list of the actions that are allowed (see
+            `policies.envs.mask_settings`); True: `action_mask`, or a method `action_masks`; None: the same, but not if
+            it were an info; False: what there may be is no mask.
 
     Raises:
         EnvError: The mask that is named cannot be one.
@@ -304,8 +319,9 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
         assert isinstance(observed, gym.spaces.Dict)
         if problem := member_problem(observed, name, sizes):
             raise EnvError(f"{env_id} observes a mask of actions, {name!r}, {problem}.", hint)
+    lists_from = _first_listed(env, setting) if lists_actions(setting) else None
     try:
-        space = MaskedBox.of(observed, sizes, name if source == "observation" else None)
+        space = MaskedBox.of(observed, sizes, name if source == "observation" else None, lists_from)
     except ValueError as error:
         if isinstance(observed, gym.spaces.Box):
             raise EnvError(f"{env_id} has a mask of actions, {name!r}, but observes {error}: masks go with vectors.",
@@ -315,23 +331,25 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
     return MasksActions(env, space, source, name)
 
 
+def _first_listed(env: gym.Env[Any, Any], setting: Setting) -> int:
+    """Return the number of the first action of an environment that lists those that are allowed.
+
+    Raises:
+        EnvError: Its actions have no numbers.
+    """
+    if isinstance(env.action_space, gym.spaces.Discrete):
+        return int(env.action_space.start)
+    raise EnvError(
+        f"{_name(env)} has {ACTION_MASK} {setting!r}, but its actions are no single choice ({env.action_space}): they "
+        "have no numbers that could be listed.",
+        f"Let it give zeros and ones, one for each value of each choice, and write env.{ACTION_MASK}: "
+        f"{names_in(setting)[0]}.",
+    )
+
+
 def may_be_masked(creator: Any, setting: Setting) -> bool:
     """Whether what a class, or a function, makes may be masked, as a vectorised version of it would not be."""
     return bool(setting) or (setting is None and hasattr(creator, METHOD))
-
-
-def check_setting(setting: Any) -> Setting:
-    """Return what an environment's arguments say of its mask.
-
-    Raises:
-        EnvError: It is neither a name nor false.
-    """
-    if setting is None or isinstance(setting, bool) or (isinstance(setting, str) and setting):
-        return setting
-    raise EnvError(
-        f"{ACTION_MASK} is {setting!r}; it must be the name of the mask, true or false.",
-        "Give the name of a member of the observations, of a method, or of an info; leave it out for 'action_mask'.",
-    )
 
 
 def _find(env: gym.Env[Any, Any], setting: Setting) -> tuple[Source, str] | None:
@@ -340,8 +358,9 @@ def _find(env: gym.Env[Any, Any], setting: Setting) -> tuple[Source, str] | None
         return None
     observed = env.observation_space
     members = observed.spaces if isinstance(observed, gym.spaces.Dict) else {}
-    name, method = (setting, setting) if isinstance(setting, str) else (ACTION_MASK, METHOD)
-    if name in members:
+    name, method = names_in(setting)
+    # A member of a fixed size is no list of a few actions.
+    if name in members and not lists_actions(setting):
         return "observation", name
     if env.has_wrapper_attr(method) and needs_nothing(env.get_wrapper_attr(method)):
         return "method", method

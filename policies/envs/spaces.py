@@ -20,6 +20,7 @@ _FLAT = "made_of"
 _OWN = "sent_as"
 """In the description of actions as policies give them, the space of the environment's own."""
 _MASK = "mask"
+_LISTS_FROM = "lists_from"
 """In the description of vectors that begin with a mask, how many values each choice has, and the mask's member."""
 PolicyActions = gym.spaces.Box | gym.spaces.Discrete[Any] | Choices
 """The spaces of actions that policies give."""
@@ -42,7 +43,8 @@ def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
     """
     if isinstance(space, MaskedBox):
         own = {} if space.original is None else {_FLAT: _describe_any(space.original)}
-        return {**_describe_box(space), **own, _MASK: {"sizes": list(space.sizes), "key": space.key}}
+        lists = {} if space.lists_from is None else {_LISTS_FROM: space.lists_from}
+        return {**_describe_box(space), **own, _MASK: {"sizes": list(space.sizes), "key": space.key, **lists}}
     if isinstance(space, FlatBox):
         return {**_describe_box(space), _FLAT: _describe_any(space.original)}
     if is_made(space):
@@ -115,15 +117,18 @@ def space_from_description(description: Mapping[str, Any]) -> PolicyActions:
 
 
 def _masked(description: Mapping[str, Any], mask: Mapping[str, Any]) -> MaskedBox:
-    sizes, key = tuple(int(size) for size in mask["sizes"]), mask["key"]
+    sizes, key, lists_from = tuple(int(size) for size in mask["sizes"]), mask["key"], mask.get(_LISTS_FROM)
     if min(sizes) < 1 or sum(sizes) > MAX_SIZE or not (key is None or isinstance(key, str)):
         raise ValueError(f"a mask {mask}")
+    if lists_from is not None and (type(lists_from) is not int or len(sizes) > 1 or key is not None):
+        raise ValueError(f"a mask {mask}")
     if (original := description.get(_FLAT)) is not None:
-        return MaskedBox.of(_any_from_description(original), sizes, key)
+        return MaskedBox.of(_any_from_description(original), sizes, key, lists_from)
     whole = _any_from_description(description)
     assert isinstance(whole, gym.spaces.Box)
     behind = slice(sum(sizes), None)
-    return MaskedBox(gym.spaces.Box(whole.low[behind], whole.high[behind], dtype=np.float32), sizes)
+    seen = gym.spaces.Box(whole.low[behind], whole.high[behind], dtype=np.float32)
+    return MaskedBox(seen, sizes, lists_from=lists_from)
 
 
 def _check_same(made: gym.Space[Any], description: Mapping[str, Any]) -> None:

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from policies.envs.atari import ATARI, AtariFrames
 from policies.envs.failures import FailureRule
 from policies.envs.flat import flattened
-from policies.envs.masks import ACTION_MASK, MaskedBox, Setting, check_setting, masked, num_masked
+from policies.envs.mask_settings import ACTION_MASK, Setting, check_setting
+from policies.envs.masks import MaskedBox, masked, num_masked
 from policies.envs.own_actions import with_own_actions
 from policies.envs.own_process import OWN_PROCESS
 from policies.envs.rendering import picture_of
@@ -235,7 +236,7 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
     with np.errstate(over="ignore"):
         low, high = (np.concatenate([bound] * num_frames, axis=-1).astype(dtype) for bound in (seen.low, seen.high))
     stacked = gym.spaces.Box(low, high, dtype=dtype.type)
-    return MaskedBox(stacked, space.sizes) if isinstance(space, MaskedBox) else stacked
+    return MaskedBox(stacked, space.sizes, lists_from=space.lists_from) if isinstance(space, MaskedBox) else stacked
 
 
 class StackFrames(gym.Wrapper[Any, Any, Any, Any]):

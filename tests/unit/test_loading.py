@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from policy_factory import make_image_policy, make_portable
 from store_parts import make_best, make_sweep
-from stores import ObjectHarness
+from stores import LocalHarness, ObjectHarness
 
 import tune_jobs
 from policies.errors import NotFoundError
@@ -49,6 +49,21 @@ def test_a_sweeps_best_is_loaded_by_its_url(tmp_path: Path) -> None:
         tune_jobs.load_policy(sweep.place)
     sweep.write_best(make_best(), make_portable("CartPole-v1"))
     assert tune_jobs.load_policy(sweep.place).env_id == "CartPole-v1"
+
+
+def test_a_sweeps_best_is_loaded_by_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = LocalHarness(tmp_path).storage().sweep("mine")
+    sweep.create()
+    sweep.write_record(make_sweep())
+    with pytest.raises(NotFoundError, match="no best policy yet"):
+        tune_jobs.load_policy(sweep.place)
+    sweep.write_best(make_best(), make_portable("CartPole-v1"))
+    assert tune_jobs.load_policy(sweep.place).env_id == "CartPole-v1"
+    monkeypatch.chdir(sweep.place)
+    assert tune_jobs.load_policy(".").env_id == "CartPole-v1"
+    # A folder that holds none is no sweep's, whatever it is called.
+    with pytest.raises(NotFoundError, match="There is no policy file"):
+        tune_jobs.load_policy(tmp_path)
 
 
 def test_a_file_is_loaded_without_ray_torch_or_what_asks_an_object_store(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from policies.acting.baselines import BASELINES
 from policies.envs.failures import check_failure_penalty
 from policies.envs.make import EnvInfo
-from policies.envs.masks import ACTION_MASK, seen_by_networks
+from policies.envs.mask_settings import ACTION_MASK
+from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices
 from policies.envs.space_hints import channels_last_hint
 from policies.envs.wrappers import PIXELS, RESERVED

@@ -24,7 +24,8 @@ from tune_jobs.spec.atari import AtariSpec, atari_from_a_flag
 from tune_jobs.spec.domain_kinds import Number, WholeNumber
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import ENGINES
-from tune_jobs.spec.fields import Flag, NameText, NonNegativeWhole, PositiveNumber, PositiveWhole, Section, name_or_flag
+from tune_jobs.spec.fields import Flag, NameText, NonNegativeWhole, PositiveNumber, PositiveWhole, Section
+from tune_jobs.spec.masks import ListedActions, mask_as_given
 from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.spec.seeds import MAX_EPISODES, SEEDS_PER_TRIAL
 
@@ -63,11 +64,12 @@ class EnvSpec(Section):
     pixels: Flag = Field(
         default=False, description="Observe small grey images of what the env renders, not its numbers."
     )
-    action_mask: Annotated[NameText | bool | None, BeforeValidator(name_or_flag)] = Field(
+    action_mask: Annotated[NameText | bool | ListedActions | None, BeforeValidator(mask_as_given)] = Field(
         None,
         description="The name of what says which actions are allowed: a member of Dict observations, a method, or an "
-        "info of reset and step. true: a member action_mask, the method that MaskablePPO asks for, or an info "
-        "action_mask. null: the first two, if there is one. false: what there is, is no mask.",
+        "info of reset and step; {actions: NAME} if it lists them in place of zeros and ones. true: a member "
+        "action_mask, the method that MaskablePPO asks for, or an info action_mask. null: the first two, if there is "
+        "one. false: what there is, is no mask.",
     )
     atari: Annotated[AtariSpec | None, BeforeValidator(atari_from_a_flag)] = Field(
         None,
@@ -94,7 +96,7 @@ class EnvSpec(Section):
             self.args,
             frame_stack=self.frame_stack,
             pixels=self.pixels,
-            action_mask=self.action_mask,
+            action_mask=dict(self.action_mask) if isinstance(self.action_mask, ListedActions) else self.action_mask,
             atari=None if self.atari is None else self.atari.frames,
             own_process=self.own_process,
         )

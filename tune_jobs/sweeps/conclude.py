@@ -14,7 +14,7 @@ from analysis.selection import best_checkpoint as best_of
 from policies.acting.baselines import BASELINES, ConstantPolicy
 from policies.acting.load import load_policy, policy_from_portable
 from policies.acting.policy import Policy, RandomPolicy
-from policies.envs.masks import ACTION_MASK
+from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.modules import allow_modules
 from policies.envs.wrappers import FRAME_STACK, PIXELS
 from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from policies.acting import load
 from policies.arguments import checked
+from tune_jobs.store.names import SWEEP_RECORD
 from tune_jobs.store.urls import is_url
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ def load_policy(path: str | Path) -> Policy:
     A policy whose network is an RLModule of the user's own needs both, and its class has to be in an allowed module.
 
     Args:
-        path: `policy.json`, `policy.safetensors`, or the folder that holds them; or the URL of a sweep in an object
-            store, whose best policy is fetched.
+        path: `policy.json`, `policy.safetensors`, or the folder that holds them; or the folder of a sweep, or its URL
+            in an object store, of which it is the best policy.
 
     Raises:
         NotFoundError: There is no such file, or the sweep has no best policy yet.
@@ -29,7 +30,7 @@ def load_policy(path: str | Path) -> Policy:
         SpecError: It needs a class from a module that is not allowed, or the URL is wrong.
         CannotRunError: The object store cannot be read.
     """
-    if not is_url(path):
+    if not is_url(path) and not Path(path, SWEEP_RECORD).is_file():
         return load.load_policy(path)
     from tune_jobs.sweeps.sources import find_sweep
 

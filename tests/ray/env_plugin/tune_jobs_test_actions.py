@@ -79,15 +79,21 @@ class Forbidding(gym.Env[Any, Any]):
         place: Where the mask is: `observation`, `info` or `method`.
         num_choices: For several choices at once, each for its share of the reward; None: one.
         goes_wrong: What the mask is in the third step: `nothing` allowed, `short`, `twos`, or `missing`; None: as ever.
+        lists: Whether it lists the actions that are allowed in place of a mask, as an info or by a method.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
     ORDER = (2, 0, 3, 1)
 
     def __init__(
-        self, *, place: str = "observation", num_choices: int | None = None, goes_wrong: str | None = None
+        self,
+        *,
+        place: str = "observation",
+        num_choices: int | None = None,
+        goes_wrong: str | None = None,
+        lists: bool = False,
     ) -> None:
-        self.place, self.goes_wrong = place, goes_wrong
+        self.place, self.goes_wrong, self.lists = place, goes_wrong, lists
         self.sizes = [4] * (num_choices or 1)
         numbers = spaces.Box(-1.0, 1.0, (2,), np.float32)
         mask = spaces.MultiBinary(sum(self.sizes))
@@ -103,6 +109,8 @@ class Forbidding(gym.Env[Any, Any]):
             self.action_masks = self._said
 
     def _said(self) -> Any:
+        if self.lists:
+            return [7 + int(index) for index in np.flatnonzero(self.mask)]
         if self.ticks != 2 or self.goes_wrong is None:
             return self.mask.copy()
         return {"nothing": 0 * self.mask, "short": self.mask[1:], "twos": 2 * self.mask}.get(self.goes_wrong)

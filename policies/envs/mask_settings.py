@@ -1,0 +1,44 @@
+"""What an environment's arguments say of its mask of actions: what it is called, and whether it lists actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias, cast
+
+from policies.errors import EnvError
+
+ACTION_MASK = "action_mask"
+"""The key of an environment's arguments that names its mask, and the name of a mask that needs not be named."""
+METHOD = "action_masks"
+"""The method that needs not be named."""
+ACTIONS = "actions"
+"""The key of the name of a list of the actions that are allowed, where there are no zeros and ones."""
+
+Setting: TypeAlias = str | bool | Mapping[str, str] | None
+
+
+def check_setting(setting: Any) -> Setting:
+    """Return what an environment's arguments say of its mask.
+
+    Raises:
+        EnvError: It is neither a name, nor {actions: a name}, nor true or false.
+    """
+    name = setting[ACTIONS] if isinstance(setting, Mapping) and set(setting) == {ACTIONS} else setting
+    if (isinstance(name, str) and name) or setting is None or isinstance(setting, bool):
+        return cast("Setting", setting)
+    raise EnvError(
+        f"{ACTION_MASK} is {setting!r}; it must be the name of the mask, {{{ACTIONS}: the name of a list of the "
+        "actions that are allowed}, true or false.",
+        "Give the name of a member of the observations, of a method, or of an info; leave it out for 'action_mask'.",
+    )
+
+
+def names_in(setting: Setting) -> tuple[str, str]:
+    """Return what a member or an info is called, and what a method is."""
+    name = setting[ACTIONS] if isinstance(setting, Mapping) else setting
+    return (name, name) if isinstance(name, str) else (ACTION_MASK, METHOD)
+
+
+def lists_actions(setting: Setting) -> bool:
+    """Whether what is named lists the actions that are allowed."""
+    return isinstance(setting, Mapping)
