@@ -31,7 +31,7 @@ from policies.envs.flat import FlatBox
 from policies.envs.make import check_env
 from policies.envs.mask_hints import argument_hint
 from policies.envs.mask_settings import ACTION_MASK
-from policies.envs.masks import FORBIDDEN, MaskedBox, draw_allowed, num_masked
+from policies.envs.masks import FORBIDDEN, MaskedBox, draw_allowed, num_masked, seen_by_networks
 from policies.envs.own_actions import Choices, is_made, own_actions
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
@@ -206,6 +206,7 @@ class NetworkPolicy(WeightsPolicy):
         super().__init__(portable, description)
         self._forward = ForwardPass(portable.network)
         self._num_masked = num_masked(self.observation_space)
+        self._seen_shape = seen_by_networks(self.observation_space).shape or ()
 
     def outputs(self, observations: ArrayLike) -> NDArray[np.float32]:
         """Return the network's raw output: logits, means and log standard deviations, Q-values, or advantages.
@@ -220,7 +221,8 @@ class NetworkPolicy(WeightsPolicy):
         if not self._num_masked:
             return self._forward(rows)
         # One piece of memory: what a row gives may not depend on how it lies there.
-        outputs = self._forward(np.ascontiguousarray(rows[:, self._num_masked :]))
+        seen = np.ascontiguousarray(rows[:, self._num_masked :]).reshape(-1, *self._seen_shape)
+        outputs = self._forward(seen)
         return np.where(rows[:, : self._num_masked] > 0, outputs, np.float32(FORBIDDEN))
 
     def _act_batch(self, observations: NDArray[np.float32]) -> NDArray[Any]:

@@ -64,7 +64,7 @@ _BY_WORDS = (
     ),
 )
 """What to do about errors of some class with some words."""
-_REFUSES = re.compile("(?i)valid|legal|allowed|permitted|feasible|available|masked")
+_REFUSES = re.compile("(?i)valid|legal|allowed|permitted|feasible|available|masked|admissible|forbid")
 _IF_REFUSED = (
     "If it refuses an action that is not allowed at the time, a mask must say so: see 'Actions that are not always "
     "allowed' in docs/guides/own-environment.md."

@@ -106,7 +106,7 @@ class EnvInfo:
     @property
     def observes_images(self) -> bool:
         """Whether observations are images, of shape (rows, columns, channels), and not vectors."""
-        return len(self.observation_space.shape or ()) == 3
+        return len(seen_by_networks(self.observation_space).shape or ()) == 3
 
 
 def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algorithm | None = None) -> EnvInfo:

@@ -37,7 +37,7 @@ class MaskedBox(gym.spaces.Box):
     """Vectors that begin with a mask.
 
     Args:
-        seen: The space of what is behind the mask, which networks see.
+        seen: The space of what is behind the mask, which networks see; of images, the numbers in a row.
         sizes: How many values each choice of an action has.
         original: The environment's own space; None: that is not known, as of stacked frames.
         key: The member of the environment's Dict that is the mask; None: it does not come with the observation.
@@ -62,7 +62,7 @@ class MaskedBox(gym.spaces.Box):
         self.num_masked = sum(sizes)
         mask = np.ones(self.num_masked, np.float32)
         with np.errstate(over="ignore"):
-            low, high = (np.asarray(bound, np.float32) for bound in (seen.low, seen.high))
+            low, high = (np.asarray(bound, np.float32).ravel() for bound in (seen.low, seen.high))
         super().__init__(np.concatenate([0 * mask, low]), np.concatenate([mask, high]), dtype=np.float32)
 
     @classmethod
@@ -72,7 +72,7 @@ class MaskedBox(gym.spaces.Box):
         """Return the space for an environment's own.
 
         Raises:
-            ValueError: No vectors can be made of what is observed.
+            ValueError: Neither vectors nor images can be made of what is observed.
         """
         seen = original
         if key is not None:
@@ -80,8 +80,6 @@ class MaskedBox(gym.spaces.Box):
             seen = gym.spaces.Dict({name: space for name, space in original.spaces.items() if name != key})
         made = FlatBox(seen) if needs_flattening(seen) else seen
         assert isinstance(made, gym.spaces.Box)
-        if len(made.shape) != 1:
-            raise ValueError(f"images of shape {made.shape}")
         return cls(made, sizes, original=original, key=key, lists_from=lists_from)
 
     def joined(self, observation: Any, mask: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -94,13 +92,13 @@ class MaskedBox(gym.spaces.Box):
         numbers = seen.flat(observation) if isinstance(seen, FlatBox) else np.asarray(observation, np.float32)
         if numbers.shape != seen.shape:
             raise ValueError(f"an observation of shape {numbers.shape}, not {seen.shape}")
-        return np.concatenate([mask, numbers])
+        return np.concatenate([mask, numbers.ravel()])
 
     def joined_or_own(self, observations: Any, mask: Any) -> Any:
         """Return vectors with masks: what is one, or a batch of them, as it is; else made of observations and masks.
 
         Args:
-            observations: Vectors with masks; or, with `mask`, of what networks see; or one observation of the
+            observations: Vectors with masks; or, with `mask`, what networks see; or one observation of the
                 environment's own, or a list of such.
             mask: One for each observation; None: they are in the observations.
 
@@ -116,13 +114,7 @@ class MaskedBox(gym.spaces.Box):
             if not self._begins(observations):
                 raise ValueError("there is no mask")
             return observations
-        seen = self.seen
-        rows = seen.flat_or_own(observations) if isinstance(seen, FlatBox) else observations
-        vectors = np.asarray(rows, np.float32)
-        if vectors.shape[-1:] not in (seen.shape, self.shape):
-            raise ValueError(f"there is an observation of shape {vectors.shape[-1:]}")
-        # A mask that a vector has already is replaced.
-        vectors = vectors[..., -seen.shape[0] :]
+        vectors = self._unmasked(observations)
         if vectors.ndim == 1:
             return np.concatenate([self._checked(mask), vectors])
         if is_one_mask(mask):
@@ -131,6 +123,18 @@ class MaskedBox(gym.spaces.Box):
             raise ValueError(f"there are {len(mask)} masks for {len(vectors)} observations")
         masks = np.array([self._checked(one) for one in mask]).reshape(-1, self.num_masked)
         return np.concatenate([masks, vectors], axis=-1)
+
+    def _unmasked(self, observations: Any) -> NDArray[np.float32]:
+        """Return what networks see as vectors, shape (numbers,) or (num, numbers), without masks that there may be."""
+        seen = self.seen
+        rows = seen.flat_or_own(observations) if isinstance(seen, FlatBox) else observations
+        array = np.asarray(rows, np.float32)
+        num_dims, num_seen = len(seen.shape), math.prod(seen.shape)
+        if array.shape[-num_dims:] == seen.shape:
+            return array.reshape(*array.shape[:-num_dims], num_seen)
+        if array.shape[-1:] != self.shape:
+            raise ValueError(f"there is an observation of shape {array.shape[-num_dims:]}")
+        return array[..., -num_seen:]
 
     def _begins(self, observations: Any) -> bool:
         """Whether something is a vector that begins with a mask, or a batch of such."""
@@ -322,10 +326,7 @@ def masked(env: gym.Env[Any, Any], setting: Setting) -> Any:
     lists_from = _first_listed(env, setting) if lists_actions(setting) else None
     try:
         space = MaskedBox.of(observed, sizes, name if source == "observation" else None, lists_from)
-    except ValueError as error:
-        if isinstance(observed, gym.spaces.Box):
-            raise EnvError(f"{env_id} has a mask of actions, {name!r}, but observes {error}: masks go with vectors.",
-                           f"Observe vectors, or set env.{ACTION_MASK}: false.") from error  # fmt: skip
+    except ValueError:
         # Said by who checks the environment.
         return env
     return MasksActions(env, space, source, name)

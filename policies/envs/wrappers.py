@@ -79,7 +79,8 @@ class ObservationWrappers:
         if mask and (pixels or atari is not None):
             which = f"{PIXELS} true" if pixels else f"{ATARI} is set"
             raise EnvError(
-                f"{ACTION_MASK} is {mask!r} and {which}: masks go with vectors, not with images.",
+                f"{ACTION_MASK} is {mask!r} and {which}: masks go with what an environment itself observes, "
+                "not with pictures of it.",
                 f"Leave {PIXELS if pixels else ATARI} out, or set {ACTION_MASK}: false.",
             )
         if own_process and atari is not None:
@@ -231,6 +232,12 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
             f"Leave {FRAME_STACK} out, or choose another env.",
         )
     seen = space.seen if isinstance(space, MaskedBox) else space
+    if seen is not space and len(seen.shape) > 1:
+        raise EnvError(
+            f"{env_id} has {FRAME_STACK} {num_frames}, a mask of actions, and images of shape {seen.shape} as "
+            "observations: images with a mask cannot be stacked.",
+            f"Let a wrapper of your own stack them below the mask, or set {ACTION_MASK}: false.",
+        )
     dtype: Any = space.dtype
     # Bounds beyond what 32 bits hold, which vectors behind a mask are of, are infinite there.
     with np.errstate(over="ignore"):

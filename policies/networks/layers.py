@@ -155,14 +155,20 @@ class ObservationStatistics:
 
     def prepare(self, observations: Tensor) -> Tensor:
         """Return observations, shape (B, ...), as the networks get them: scaled and, if asked to, normalised."""
-        if self._num_masked:
-            observations = observations[..., self._num_masked :]
+        observations = self._unmasked(observations)
         if self._observation_scale != 1.0:
             observations = observations.float() * self._observation_scale
         if self._normalizes:
             factor = torch.rsqrt(self.obs_var + VARIANCE_EPSILON)
             observations = ((observations - self.obs_mean) * factor).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
         return observations
+
+    def _unmasked(self, observations: Tensor) -> Tensor:
+        """Return what is behind the masks of observations, (B, ...): vectors, or images in their shape."""
+        if not self._num_masked:
+            return observations
+        shape = seen_by_networks(self.observation_space).shape or ()
+        return observations[..., self._num_masked :].reshape(*observations.shape[:-1], *shape)
 
     def allowed(self, outputs: Tensor, observations: Tensor) -> Tensor:
         """Return logits or Q-values, `FORBIDDEN` where the masks of observations, (B, ...), forbid the action."""
@@ -183,8 +189,8 @@ class ObservationStatistics:
         num_new = len(observations)
         if not self._normalizes or num_new == 0:
             return
-        batch = torch.as_tensor(observations, device=self.obs_mean.device).double() * self._observation_scale
-        batch = batch[:, self._num_masked :] if self._num_masked else batch
+        batch = self._unmasked(torch.as_tensor(observations, device=self.obs_mean.device)).double()
+        batch *= self._observation_scale
         mean = batch.mean(dim=0)
         count = int(self.obs_count)
         total = count + num_new
@@ -200,7 +206,7 @@ class ObservationStatistics:
 
 def observation_scale(space: gym.Space[Any]) -> float:
     """Return the factor that observations are multiplied by first: 1/255 for images of bytes, else 1."""
-    return 1.0 / 255.0 if space.dtype == np.uint8 else 1.0
+    return 1.0 / 255.0 if seen_by_networks(space).dtype == np.uint8 else 1.0
 
 
 def normalization_of(mean: NDArray[Any], variance: NDArray[Any]) -> Normalization:

@@ -28,7 +28,7 @@ class Inputs:
     shape: tuple[int, ...]
     """The shape of what they see: (n,), or (height, width, channels)."""
     dtype: type[np.uint8 | np.float32]
-    """The dtype of observations; bytes are images."""
+    """The dtype of observations; bytes are images. Those of images behind a mask are floating-point numbers."""
     scale: float = 1.0
     """What observations are multiplied by first."""
     num_masked: int = 0

@@ -100,7 +100,7 @@ class Observations:
             observations = np.ascontiguousarray(observations[..., self._num_masked :])
         num_members = len(self._members)
         x: Floats = observations.reshape(*observations.shape[:-2], num_members, -1, observations.shape[-1])
-        if self._seen.is_bytes:
+        if self._seen.scale != 1.0:
             x = x.astype(np.float32)
             x *= np.float32(self._seen.scale)
         if not self._normalizes:
@@ -120,9 +120,10 @@ class Observations:
 
     def prepare_columns(self, columns: Floats) -> None:
         """Prepare observations in columns, (M, B, W or more), in place; those of bytes are prepared as tensors."""
+        columns = columns[..., self._num_masked : self._num_masked + self._seen.num_inputs]
+        if self._seen.scale != 1.0:
+            columns *= np.float32(self._seen.scale)
         if self._normalizes:
-            masked = self._num_masked
-            columns = columns[..., masked : masked + self._seen.num_inputs]
             columns -= self._mean
             columns *= self._factor
             np.clip(columns, -OBSERVATION_CLIP, OBSERVATION_CLIP, out=columns)

@@ -136,7 +136,8 @@ def as_transitions(rows: NDArray[np.float32], seen: Inputs, weights: NDArray[np.
     def observed(start: int) -> NDArray[Any]:
         columns = rows[:, start : start + seen.num_columns]
         flat = seen.bytes_in(columns) if seen.is_bytes else columns[:, : seen.num_observed]
-        return flat.reshape(-1, *seen.shape) if seen.is_image else flat
+        # Images behind a mask are rows in RLlib, too.
+        return flat.reshape(-1, *seen.shape) if seen.is_image and not seen.num_masked else flat
 
     return Transitions(
         obs=observed(0),

@@ -188,7 +188,7 @@ def odd(monkeypatch: pytest.MonkeyPatch, observations: gym.Space[Any], actions: 
         ),
         (NUMBERS, NUMBERS, "action_mask", "its actions are no choices"),
         (NUMBERS, TWO, "legal", r"there is no info\['legal'\] at the beginning of an episode, nor .*\['action_mask'\]"),
-        (spaces.Box(0, 255, (8, 8, 3), np.uint8), TWO, "action_mask", r"observes images of shape \(8, 8, 3\)"),
+        (spaces.Box(0, 255, (8, 8, 0), np.uint8), TWO, "action_mask", "its observations have 0 numbers"),
         (NUMBERS, TWO, 3, "action_mask is 3; it must be the name"),
         (NUMBERS, NUMBERS, True, "has action_mask True, but its actions are no choices"),
         (NUMBERS, TWO, "", "action_mask is ''; it must be the name"),

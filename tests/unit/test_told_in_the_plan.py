@@ -275,7 +275,10 @@ def refused_by(error: Exception) -> list[EnvFailedError]:
     return [of_rllib.value, of_packs, of_episodes.value]
 
 
-@pytest.mark.parametrize("said", ["Illegal move", "Operation 3 is not available", "valid machines are [1]"])
+@pytest.mark.parametrize(
+    "said",
+    ["Illegal move", "Operation 3 is not available", "valid machines are [1]", "3 is forbidden", "inadmissible: 3"],
+)
 def test_whoever_refuses_an_action_is_told_of_masks(said: str) -> None:
     for failed in refused_by(ValueError(said)):
         assert said in str(failed)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from policies.envs.masks import seen_by_networks
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
     DQNHyperparams,
@@ -212,7 +213,7 @@ class _Images:
             return None
         if hyperparams is None and not self._largest and self._known:
             self._largest = largest_hyperparams(self._spec, self._known)
-        shape = tuple(self._env.observation_space.shape or ())
+        shape = tuple(seen_by_networks(self._env.observation_space).shape or ())
         most = max(
             (products_per_image(shape, each) for each in ([hyperparams] if hyperparams else self._largest)), default=0
         )

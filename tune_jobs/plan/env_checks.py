@@ -152,7 +152,7 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
 
 def _example(spec: SweepSpec, env: EnvInfo) -> str:
     """Return `conv_filters` that fit the images of an environment, if their channels come last."""
-    shape = env.observation_space.shape or ()
+    shape = seen_by_networks(env.observation_space).shape or ()
     smallest = min(shape[1:] if _has_channels_first(shape) else shape[:2])
     examples = _EXAMPLES if spec.env.atari is None else _EXAMPLES_FOR_ATARI
     return next(example for fewest, example in examples if smallest >= fewest)
@@ -160,14 +160,14 @@ def _example(spec: SweepSpec, env: EnvInfo) -> str:
 
 def channels_hint(spec: SweepSpec, env: EnvInfo) -> str:
     """Return what to do about images whose channels seem to come first; empty: they don't."""
-    shape = env.observation_space.shape or ()
+    shape = seen_by_networks(env.observation_space).shape or ()
     if not _has_channels_first(shape):
         return ""
     # Frames are stacked along the last dimension.
     own_shape = (*shape[:2], shape[2] // spec.env.frame_stack)
     return (
         f"Channels come last here, (rows, columns, channels), but {own_shape} looks as if they came first. "
-        f"{channels_last_hint(env.env_id, env.observation_space, own_shape)}"
+        f"{channels_last_hint(env.env_id, seen_by_networks(env.observation_space), own_shape)}"
     )
 
 

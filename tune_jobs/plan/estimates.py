@@ -111,7 +111,7 @@ def _numbers_of_convolutions(env: EnvInfo, values: Hyperparams) -> int:
     """Return the numbers that the convolutions of one network keep of an image: the windows of kernels, and outputs."""
     if isinstance(values, RandomHyperparams) or values.conv_filters is None:
         return 0
-    shape, numbers = tuple(env.observation_space.shape or ()), 0
+    shape, numbers = tuple(seen_by_networks(env.observation_space).shape or ()), 0
     for number, (channels, kernel, _) in enumerate(values.conv_filters):
         inputs = output_shape(shape, values.conv_filters[:number])[2]
         height, width, _ = output_shape(shape, values.conv_filters[: number + 1])

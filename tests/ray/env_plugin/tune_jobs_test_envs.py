@@ -197,6 +197,33 @@ class Shades(gym.Env[NDArray[Any], Any]):
         return self._observation(), reward, self.ticks >= 10, False, {}
 
 
+class MaskedShades(Shades):
+    """The same, where each action has two numbers, of which one is allowed at each step; the mask alone says which.
+
+    A forbidden one raises an error. At the end nothing is allowed.
+    """
+
+    def __init__(self, *, as_bytes: bool = True, shape: Sequence[int] = (12, 9, 2)) -> None:
+        super().__init__(as_bytes=as_bytes, shape=shape)
+        self.action_space = gym.spaces.Discrete(4)
+        self.mask: NDArray[np.int8] = np.ones(4, np.int8)
+
+    def _observation(self) -> NDArray[Any]:
+        image = super()._observation()
+        first = self.np_random.integers(0, 2, 2)
+        self.mask = np.array([first[0], first[1], 1 - first[0], 1 - first[1]], np.int8) * (self.ticks < 10)
+        return image
+
+    def action_masks(self) -> NDArray[np.int8]:
+        """Return what is allowed."""
+        return self.mask
+
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+        if not self.mask[action]:
+            raise RuntimeError(f"the action {action} is forbidden by {self.mask}")
+        return super().step(action % 2)
+
+
 class FineShades(Shades):
     """The same of numbers from 0 to 1."""
 
@@ -317,6 +344,7 @@ def register() -> None:
         ("TestLaps-v0", Laps, None),
         ("TestShades-v0", Shades, None),
         ("TestFineShades-v0", FineShades, None),
+        ("TestMaskedShades-v0", MaskedShades, None),
         ("TestPrecise-v0", Precise, None),
         ("TestSecret-v0", Secret, None),
         ("TestReply-v0", Reply, None),
