@@ -284,6 +284,9 @@ class SweepRecord(Record):
         default=False,
         description="Whether the env's own observations were neither vectors nor images; False in older records.",
     )
+    is_masked: bool = Field(
+        default=False, description="Whether the env says which actions are allowed; False in older records."
+    )
 
     @property
     def is_population(self) -> bool:

@@ -135,9 +135,17 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
     cap = source.sweep.section("stop").get("num_env_steps")
     cap = length_of(best.point, cap) if isinstance(cap, int) else 100_000
+    is_masked = source.sweep.is_masked
     names = ("frame_stack", "pixels", "atari", "action_mask", "own_process", "failure_penalty")
-    changed = [name for name in names if env.get(name) not in (None, 1, False)]
+    changed = [
+        name for name in names if env.get(name) not in (None, 1, False) and not (is_masked and name == "action_mask")
+    ]
     note = f" The env's {', '.join(changed)} are left out." if changed else ""
+    if is_masked:
+        note += (
+            " The env's mask of actions is left out: what it does not allow is tried there, unless a class that knows "
+            "masks is taken, such as MaskablePPO of sb3-contrib."
+        )
     flattens = source.sweep.is_flattened
     if spec.get("rl_module"):
         note += " The RLModule of your own is left out."

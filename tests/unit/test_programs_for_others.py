@@ -261,3 +261,20 @@ def test_a_sweeps_record_says_whether_observations_are_made_vectors(tmp_path: Pa
     for env_id, flattened in (("CartPole-v1", False), ("FrozenLake-v1", True)):
         store = make_sweep_folder(tmp_path / env_id, env=env_id)
         assert store.read_record().is_flattened is flattened
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_programs_of_a_report_say_that_they_know_no_mask(masked: bool) -> None:
+    made = make_sweep()
+    made.sweep = made.sweep.model_copy(update={"is_masked": masked})
+    best = setting(0, [made.trials[0].trial_id], 1)
+    steps = next_steps.section(source_of(made, settings_of(best))).steps
+    told = [step.why for step in steps if step.title.startswith("The setting in ")]
+    assert len(told) == 2
+    assert ["MaskablePPO" in why for why in told] == [masked] * 2
+
+
+def test_a_sweeps_record_says_whether_actions_are_masked(tmp_path: Path) -> None:
+    for mask in (False, True):
+        store = make_sweep_folder(tmp_path / str(mask), env={"id": "Taxi-v3", "action_mask": mask})
+        assert store.read_record().is_masked is mask

@@ -66,6 +66,7 @@ def write_new(
             prior=plan.prior,
             env_threshold=plan.env.threshold,
             is_flattened=plan.env.is_flattened,
+            is_masked=plan.env.mask is not None,
         )
     )
 
