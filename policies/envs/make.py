@@ -337,9 +337,9 @@ def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseExc
         raise error
     if isinstance(error, EnvError):  # raised by a wrapper, with a message of its own
         return error
-    detail = said_by(error) or f"at {place_in_env(error) or 'a place that is not its own'}"
-    given = constructor_args(env_args or {})
-    arguments = f" with arguments {given!r}" if given else ""
+    said, place = said_by(error), place_in_env(error)
+    detail = f"{said}{f' ({place})' if place else ''}" if said else f"at {place or 'a place that is not its own'}"
+    arguments = f" with arguments {given!r}" if (given := constructor_args(env_args or {})) else ""
     message = f"The environment {env_id!r} cannot be made{arguments}: {type(error).__name__}: {detail}."
     if "box2d" in detail.lower():
         # gymnasium[box2d] asks for a source build; this wheel holds the same module.
