@@ -184,13 +184,9 @@ def test_a_constructor_that_fails_without_a_word_is_told_with_its_place() -> Non
 
 
 def test_a_constructor_that_fails_with_words_is_told_with_its_place_too() -> None:
-    with pytest.raises(EnvError, match=r": ValueError: the motor broke \(\S*hostile_envs.py:\d+ in \w+\)\.\n") as caught:
+    with pytest.raises(EnvError, match=r": ValueError: the motor broke \(\S*hostile_envs.py:\d+ in fail\)") as caught:
         check_env("hostile_envs:Hostile", {"how": "fail", "where": "constructor"}, None)
     assert "documentation" in caught.value.hint
-    # Gymnasium's own environments have no place of their own.
-    with pytest.raises(EnvError) as caught:
-        check_env("LunarLander-v3", {"gravity": 5.0}, None)
-    assert ".py:" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
