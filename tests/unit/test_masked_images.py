@@ -132,6 +132,43 @@ def test_a_board_of_whole_numbers_is_an_image_too() -> None:
         assert policy.act(np.ones((3, 6, 7, 2), np.int8), mask=[[0, 0, 1, 0, 0, 0, 0]] * 3).tolist() == [2, 2, 2]
 
 
+class Hand(Board):
+    """A board beside other members."""
+
+    def __init__(self, *, has_mask: bool) -> None:
+        mask = {"action_mask": gym.spaces.MultiBinary(7)} if has_mask else {}
+        self.observation_space = gym.spaces.Dict(
+            {"cards": gym.spaces.Discrete(3), "board": Board.observation_space, **mask}
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        board, info = super().reset(seed=seed)
+        mask = {"action_mask": info["legal"]} if "action_mask" in self.observation_space.spaces else {}
+        return {"cards": 1, "board": board, **mask}, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.reset()[0], 0.0, True, False, {}
+
+
+@pytest.mark.parametrize("has_mask", [False, True])
+def test_convolutions_for_a_member_come_with_what_observes_it_alone(has_mask: bool) -> None:
+    with registered("TestHand-v0", Hand):
+        spec = load_spec({"env": {"id": "TestHand-v0", "args": {"has_mask": has_mask}}, "algorithm": "ppo"})
+        info = check_env("TestHand-v0", {"has_mask": has_mask}, "ppo")
+        assert not info.observes_images
+        with pytest.raises(SpecError, match=r"are flat, of shape \(87,\): convolutions are for images") as caught:
+            check_env_rules(spec, info, [PPOHyperparams(conv_filters=FILTERS)])
+    assert "Leave hyperparams.conv_filters out, or observe observation['board'] alone" in caught.value.hint
+    assert "lambda seen: seen['board']" in caught.value.hint
+    assert ("with the mask as a method of its own, action_masks" in caught.value.hint) is has_mask
+    cartpole = check_env("CartPole-v1", None, "ppo")
+    with pytest.raises(SpecError, match="convolutions are for images") as caught:
+        check_env_rules(
+            load_spec({"env": "CartPole-v1", "algorithm": "ppo"}), cartpole, [PPOHyperparams(conv_filters=FILTERS)]
+        )
+    assert caught.value.hint == "Leave hyperparams.conv_filters out, or observe images with env.pixels: true."
+
+
 def test_frames_of_masked_images_are_not_stacked() -> None:
     with pytest.raises(EnvError, match="images with a mask cannot be stacked") as caught:
         check_env(ENV, {"frame_stack": 2})
