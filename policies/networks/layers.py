@@ -123,7 +123,7 @@ def initialize(module: nn.Module, initializer: str, gain: float) -> None:
 
 
 class ObservationStatistics:
-    """Mixin for an RLModule: scales uint8 observations by 1/255 and, if asked to, normalises observations.
+    """Mixin for an RLModule: scales uint8 observations to [0, 1] and, if asked to, normalises observations.
 
     Where observations begin with a mask, networks see what is behind it, and `allowed` applies it to what they give.
 
@@ -156,7 +156,7 @@ class ObservationStatistics:
     def prepare(self, observations: Tensor) -> Tensor:
         """Return observations, shape (B, ...), as the networks get them: scaled and, if asked to, normalised."""
         observations = self._unmasked(observations)
-        if self._observation_scale != 1.0:
+        if self._observation_scale != 1.0 or observations.dtype == torch.uint8:
             observations = observations.float() * self._observation_scale
         if self._normalizes:
             factor = torch.rsqrt(self.obs_var + VARIANCE_EPSILON)
@@ -205,8 +205,14 @@ class ObservationStatistics:
 
 
 def observation_scale(space: gym.Space[Any]) -> float:
-    """Return the factor that observations are multiplied by first: 1/255 for images of bytes, else 1."""
-    return 1.0 / 255.0 if seen_by_networks(space).dtype == np.uint8 else 1.0
+    """Return the factor that observations are multiplied by first, so that images of bytes are of 0 to 1.
+
+    It is 1 over the largest number that the space has: 1/255 of pixels, 1 of a board's zeros and ones.
+    """
+    seen = seen_by_networks(space)
+    if not isinstance(seen, gym.spaces.Box) or seen.dtype != np.uint8:
+        return 1.0
+    return 1.0 / max(1.0, float(seen.high.max()))
 
 
 def normalization_of(mean: NDArray[Any], variance: NDArray[Any]) -> Normalization:

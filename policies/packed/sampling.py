@@ -100,7 +100,7 @@ class Observations:
             observations = np.ascontiguousarray(observations[..., self._num_masked :])
         num_members = len(self._members)
         x: Floats = observations.reshape(*observations.shape[:-2], num_members, -1, observations.shape[-1])
-        if self._seen.scale != 1.0:
+        if self._seen.is_bytes or self._seen.scale != 1.0:
             x = x.astype(np.float32)
             x *= np.float32(self._seen.scale)
         if not self._normalizes:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
-BYTES, NUMBERS, MASKED = "TestShades-v0", "TestFineShades-v0", "TestMaskedShades-v0"
+BYTES, NUMBERS, MASKED, BITS = "TestShades-v0", "TestFineShades-v0", "TestMaskedShades-v0", "TestBits-v0"
 FILTERS = ((5, 4, 2), (3, 2, 1))
 """12 x 9 x 2 -> 5 x 3 x 5 -> 4 x 2 x 3."""
 # As in `packed_rllib` and `packed_dqn`, but the gradient of a kernel is a sum over its 15 places in each row, too.
@@ -57,6 +57,7 @@ PPO: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
     "masked bytes, KL": (MASKED, {"conv_filters": FILTERS, "use_kl_loss": True}, [
         {"kl_coeff": 0.7}, {"hidden_sizes": (5,), "entropy_coeff": 0.1},
     ]),
+    "zeros and ones": (BITS, {"conv_filters": FILTERS}, [{}, {"hidden_sizes": (5,)}]),
     "masked bytes, normalised": (MASKED, {"conv_filters": FILTERS, "normalize_observations": True}, [{}]),
 }  # fmt: skip
 DQN: dict[str, tuple[str, list[dict[str, Any]]]] = {
@@ -72,6 +73,7 @@ DQN: dict[str, tuple[str, list[dict[str, Any]]]] = {
         {"conv_filters": FILTERS, "replay": "prioritized", "double_q": False, "dueling": False, "activation": "tanh",
          "hidden_sizes": (6,), "optimizer_epsilon": 1e-3},
     ]),
+    "zeros and ones": (BITS, [{"conv_filters": FILTERS}, {"conv_filters": FILTERS, "hidden_sizes": (5,)}]),
     "masked bytes, double, dueling": (MASKED, [
         {"conv_filters": FILTERS, "target_update_freq": 10}, {"conv_filters": FILTERS, "hidden_sizes": (5,)},
     ]),
@@ -187,19 +189,20 @@ VALUES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 NUM_ITERATIONS = 5
-# With the larger rate, four actions instead of two end without entropy before all are right.
-FOR_MASKED: dict[str, dict[str, Any]] = {"ppo": {"lr": 0.001}, "dqn": {}}
+# With the larger rate, four actions instead of two end without entropy before all are right, and it makes up for zeros
+# and ones that are not scaled as such: multiplied by 1/255, they come to 5.0 to 5.3 with the smaller one.
+OTHERS: dict[str, dict[str, Any]] = {"ppo": {"lr": 0.001}, "dqn": {}}
 
 
 def task_of(folder: Path, algorithm: str, seed: int, env_id: str = BYTES) -> TrialTask:
     return make_task(
-        folder, algorithm, **{**VALUES[algorithm], **(FOR_MASKED[algorithm] if env_id == MASKED else {})},
+        folder, algorithm, **{**VALUES[algorithm], **({} if env_id == BYTES else OTHERS[algorithm])},
         trial_id=f"t{seed:04d}", seed=1024 * (seed + 1), env_id=env_id, evaluation_seeds=SEEDS,
         stop=StopSpec(num_iterations=NUM_ITERATIONS), evaluation=EvaluationSpec(num_episodes=len(SEEDS)),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("env_id", [BYTES, MASKED])
+@pytest.mark.parametrize("env_id", [BYTES, MASKED, BITS])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_a_pack_learns_to_look(algorithm: str, env_id: str, tmp_path: Path) -> None:
     tasks = [task_of(tmp_path, algorithm, seed, env_id) for seed in range(2)]

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -13,10 +14,12 @@ from packed_members import MODULES
 from torch import nn
 
 from policies.activations import ACTIVATIONS
+from policies.envs.masks import MaskedBox
 from policies.envs.spaces import observation_dtype
 from policies.errors import SpecError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
 from policies.networks.denormals import denormals_as_zero
+from policies.networks.layers import observation_scale
 from policies.packed import optimizers
 from policies.packed.acting import ActingNetworks, ActingOnDevice
 from policies.packed.convolutions import convolutions_for
@@ -26,6 +29,7 @@ from policies.packed.member import Member, group_members, network_layouts
 from policies.packed.networks import with_ones
 from policies.packed.optimizers import StackedAdam, StackedRMSprop
 from policies.packed.rows import StackedRows
+from policies.packed.sampling import Observations
 
 IMAGE = (9, 7, 3)
 # Places between the windows that no kernel sees, windows that overlap, and a kernel of one pixel.
@@ -169,6 +173,19 @@ def test_bytes_lie_in_columns_and_come_out_as_they_were(shape: tuple[int, ...]) 
         rows = torch.from_numpy(moved).view(150, -1).index_select(0, torch.arange(150))[:, : inputs.num_columns]
     np.testing.assert_array_equal(inputs.bytes_in(moved[..., : inputs.num_columns]), images)
     np.testing.assert_array_equal(inputs.bytes_in_tensor(rows), images.reshape(150, -1))
+
+
+@pytest.mark.parametrize(("highest", "scale"), [(255, 1 / 255), (1, 1.0), (9, 1 / 9), (0, 1.0)])
+def test_bytes_are_scaled_by_the_largest_that_there_may_be(highest: int, scale: float) -> None:
+    space = gym.spaces.Box(0, highest, (4, 4, 16), np.uint8)
+    masked = MaskedBox(space, (4,))
+    stacked = gym.spaces.Box(0, highest, (4, 4, 32), np.uint8)
+    assert Inputs.of(space).scale == Inputs.of(masked).scale == Inputs.of(stacked).scale == scale
+    assert observation_scale(gym.spaces.Box(0, highest, (4, 4, 16), np.float32)) == 1.0
+    boards = np.random.default_rng(0).integers(0, highest + 1, (3, 4, 4, 16), dtype=np.uint8)
+    seen = Observations([cast("Any", None)], 3, normalizes=False, seen=Inputs.of(space)).prepare(boards.reshape(3, -1))
+    assert seen.dtype == np.float32
+    np.testing.assert_allclose(seen[0], boards.reshape(3, -1) * scale, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("dtype", "scale"), [(np.uint8, 1 / 255), (np.float32, 1.0)])

@@ -197,6 +197,21 @@ class Shades(gym.Env[NDArray[Any], Any]):
         return self._observation(), reward, self.ticks >= 10, False, {}
 
 
+class Bits(Shades):
+    """The same of zeros and ones, in bytes, as boards of games are; of the brighter half more are ones."""
+
+    def __init__(self, *, shape: Sequence[int] = (12, 9, 2), highest: int = 1) -> None:
+        super().__init__(shape=shape)
+        self.observation_space = gym.spaces.Box(0, highest, tuple(shape), np.uint8)
+
+    def _observation(self) -> NDArray[Any]:
+        self.right = int(self.np_random.integers(2))
+        chances = np.full(self.observation_space.shape or (), 0.3)
+        half = chances.shape[0] // 2
+        chances[half * self.right : half * (self.right + 1)] = 0.7
+        return (self.np_random.random(chances.shape) < chances).astype(np.uint8)
+
+
 class MaskedShades(Shades):
     """The same, where each action has two numbers, of which one is allowed at each step; the mask alone says which.
 
@@ -345,6 +360,7 @@ def register() -> None:
         ("TestShades-v0", Shades, None),
         ("TestFineShades-v0", FineShades, None),
         ("TestMaskedShades-v0", MaskedShades, None),
+        ("TestBits-v0", Bits, None),
         ("TestPrecise-v0", Precise, None),
         ("TestSecret-v0", Secret, None),
         ("TestReply-v0", Reply, None),
