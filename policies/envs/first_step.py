@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -28,24 +28,32 @@ _STEP_HINT = (
     "Mend its step(): Gymnasium's API wants (observation, reward, terminated, truncated, info), with an observation of "
     "the observation space, a finite number, two bools and a dict."
 )
+_IMAGE = 3
+"""The dimensions of an image."""
 _RESET_HINT = (
     "Mend its reset(): Gymnasium's API wants (observation, info), with an observation of the observation space and a "
     "dict."
 )
 
 
-def check_first_step(
-    env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]
-) -> tuple[Mapping[str, Any], str | None]:
+class FirstStep(NamedTuple):
+    """What an environment showed when it was tried."""
+
+    infos: Mapping[str, Any]
+    """Those of its first reset."""
+    unrepeated: str | None
+    """How the first observation differs when the same seed is given again; None: it does not."""
+    largest_byte: int | None
+    """The largest number in two images of bytes; None: it observes no such."""
+
+
+def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> FirstStep:
     """Reset an environment, step it once with some action, check what it returns, and reset it again.
 
     Args:
         env: The environment.
         env_id: Its id, for messages.
         env_args: The arguments of its constructor, for messages.
-
-    Returns:
-        The first infos, and how the first observation differs when the same seed is given again; None: it does not.
 
     Raises:
         EnvFailedError: The env raised an error.
@@ -62,12 +70,21 @@ def check_first_step(
     first = np.array(observation, np.float64)  # the env may write the next one into it
     # As the env itself gets it, so that its author can repeat the call.
     own = space.own(action) if is_made(space) else action
-    _check_call(
+    second, *_ = _check_call(
         env, "step", lambda: env.step(action),
         find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {own!r} after a reset",
         hint=_STEP_HINT,
     )  # fmt: skip
-    return dict(infos), _other_again(env, first)
+    largest = max(_largest_byte(env.observation_space, one) for one in (first, second))
+    return FirstStep(dict(infos), _other_again(env, first), None if largest < 0 else largest)
+
+
+def _largest_byte(space: gym.Space[Any], observation: Any) -> int:
+    """Return the largest number of an image of bytes; -1: networks see no such."""
+    seen = seen_by_networks(space)
+    if seen.dtype != np.uint8 or len(seen.shape or ()) < _IMAGE:
+        return -1
+    return int(np.ravel(observation)[num_masked(space) :].max())
 
 
 def _other_again(env: gym.Env[Any, Any], first: NDArray[np.float64]) -> str | None:

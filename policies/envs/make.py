@@ -59,20 +59,10 @@ __all__ = [
 FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES = "failure_penalty", "atari_training", "allowed_modules"
 # Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and the keys of env runners
 # from above.
-_RESERVED_ARGS = frozenset(
-    {
-        "id",
-        "render_mode",
-        "disable_env_checker",
-        "num_envs",
-        "vectorization_mode",
-        "vector_kwargs",
-        "wrappers",
-        FAILURE_PENALTY,
-        ATARI_TRAINING,
-        ALLOWED_MODULES,
-    }
-)
+_RESERVED_ARGS = frozenset({
+    "id", "render_mode", "disable_env_checker", "num_envs", "vectorization_mode", "vector_kwargs", "wrappers",
+    FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES,
+})  # fmt: skip
 _RGB_ARRAY = "rgb_array"
 # The one argument of gym.make, not of the constructor, that a sweep file may set.
 _MAKE_ARGS = frozenset({"max_episode_steps"})
@@ -102,6 +92,8 @@ class EnvInfo:
     """Whether its own observations are neither vectors nor images, and were made such (`policies.envs.flat`)."""
     unrepeated: str | None = None
     """How its first observation differs when the same seed is given again; None: it does not."""
+    largest_byte: int | None = None
+    """The largest number in its first two images of bytes; None: it observes no such."""
 
     @property
     def observes_images(self) -> bool:
@@ -146,9 +138,9 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         _check_action_space(info, algorithm)
         _check_observation_space(info)
         _check_keys(info)
-        infos, unrepeated = check_first_step(env, info.env_id, constructor_args(info.env_args))
-        unused = None if mask is not None or wrappers.action_mask is not None else unused_mask(env, infos)
-        return replace(info, unused_mask=unused, unrepeated=unrepeated)
+        tried = check_first_step(env, info.env_id, constructor_args(info.env_args))
+        unused = None if mask is not None or wrappers.action_mask is not None else unused_mask(env, tried.infos)
+        return replace(info, unused_mask=unused, unrepeated=tried.unrepeated, largest_byte=tried.largest_byte)
     finally:
         close_env(env)
 

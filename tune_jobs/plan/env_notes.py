@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.spaces.utils import flatdim
 
 from analysis.wording import counted, duration
+from policies.acting.baselines import BASELINES
 from policies.acting.evaluate import MAX_EPISODE_STEPS
 from policies.envs.flat import FlatBox, leaves, named
 from policies.envs.make import EnvInfo
@@ -26,6 +27,8 @@ _IMAGE = 3
 _MOST_CHANNELS = 16
 """Of an image: four frames in colour. NetHack's texts are of three dimensions, too, none of which is as small."""
 _LONG_EPISODE_S = 60.0
+_FEW_TIMES = 20
+"""How many times what is seen the space allows, from where that is told: MiniGrid's numbers are up to 10 of 255."""
 _FEW_NUMBERS = 3_000
 """An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
 
@@ -48,6 +51,26 @@ def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.
         yield f"Convolutions go over the first two dimensions of images. {hint}"
+    if note := _note_on_bytes(spec, env, seen):
+        yield note
+
+
+def _note_on_bytes(spec: SweepSpec, env: EnvInfo, seen: gym.Space[Any]) -> str | None:
+    """Return a note on images whose bytes are all but zero once they are divided by what they may be; None: none is."""
+    name = "normalize_observations"
+    if env.largest_byte is None or spec.rl_module is not None or spec.algorithm in BASELINES:
+        return None
+    if name in spec.space or spec.hyperparams.get(name):
+        return None
+    assert isinstance(seen, gym.spaces.Box)
+    highest = int(seen.high.max())
+    if not 0 < env.largest_byte <= highest / _FEW_TIMES:
+        return None
+    return (
+        f"The first images of {env.env_id} have numbers of up to {env.largest_byte}, and its space allows {highest}: "
+        f"divided by {highest}, as images of bytes are, they are next to nothing for a network. hyperparams.{name}: "
+        "true brings them to a usual size; so does a space that says what they are."
+    )
 
 
 def _on_actions(env: EnvInfo) -> Iterator[str]:
