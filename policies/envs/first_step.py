@@ -28,12 +28,18 @@ _STEP_HINT = (
     "Mend its step(): Gymnasium's API wants (observation, reward, terminated, truncated, info), with an observation of "
     "the observation space, a finite number, two bools and a dict."
 )
-_IMAGE = 3
-"""The dimensions of an image."""
 _RESET_HINT = (
     "Mend its reset(): Gymnasium's API wants (observation, info), with an observation of the observation space and a "
     "dict."
 )
+
+
+class Largest(NamedTuple):
+    """The number farthest from 0 in the first observation, of those that networks see."""
+
+    value: float
+    place: str
+    """Where the environment itself has it: `observation['x'][0]`, or `[3]`."""
 
 
 class FirstStep(NamedTuple):
@@ -43,8 +49,7 @@ class FirstStep(NamedTuple):
     """Those of its first reset."""
     unrepeated: str | None
     """How the first observation differs when the same seed is given again; None: it does not."""
-    largest_byte: int | None
-    """The largest number in two images of bytes; None: it observes no such."""
+    largest: Largest
 
 
 def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> FirstStep:
@@ -70,21 +75,18 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
     first = np.array(observation, np.float64)  # the env may write the next one into it
     # As the env itself gets it, so that its author can repeat the call.
     own = space.own(action) if is_made(space) else action
-    second, *_ = _check_call(
+    _check_call(
         env, "step", lambda: env.step(action),
         find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {own!r} after a reset",
         hint=_STEP_HINT,
     )  # fmt: skip
-    largest = max(_largest_byte(env.observation_space, one) for one in (first, second))
-    return FirstStep(dict(infos), _other_again(env, first), None if largest < 0 else largest)
+    return FirstStep(dict(infos), _other_again(env, first), _largest(env.observation_space, first))
 
 
-def _largest_byte(space: gym.Space[Any], observation: Any) -> int:
-    """Return the largest number of an image of bytes; -1: networks see no such."""
-    seen = seen_by_networks(space)
-    if seen.dtype != np.uint8 or len(seen.shape or ()) < _IMAGE:
-        return -1
-    return int(np.ravel(observation)[num_masked(space) :].max())
+def _largest(space: gym.Space[Any], observation: NDArray[np.float64]) -> Largest:
+    values, behind_mask = observation.ravel(), num_masked(space)
+    number = behind_mask + int(np.argmax(np.abs(values[behind_mask:])))
+    return Largest(float(values[number]), _place_in(space, number))
 
 
 def _other_again(env: gym.Env[Any, Any], first: NDArray[np.float64]) -> str | None:

@@ -25,7 +25,7 @@ from policies.envs.calls import Call
 from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.envs.faults import close_env, hint_on, is_of_env, place_in_env
-from policies.envs.first_step import check_first_step
+from policies.envs.first_step import Largest, check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import as_creator, find_env, normalize_env_id
 from policies.envs.mask_hints import UnusedMask, unused_mask
@@ -92,8 +92,8 @@ class EnvInfo:
     """Whether its own observations are neither vectors nor images, and were made such (`policies.envs.flat`)."""
     unrepeated: str | None = None
     """How its first observation differs when the same seed is given again; None: it does not."""
-    largest_byte: int | None = None
-    """The largest number in its first two images of bytes; None: it observes no such."""
+    largest: Largest | None = None
+    """The number farthest from 0 in its first observation; None: it was not looked at."""
 
     @property
     def observes_images(self) -> bool:
@@ -140,7 +140,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         _check_keys(info)
         tried = check_first_step(env, info.env_id, constructor_args(info.env_args))
         unused = None if mask is not None or wrappers.action_mask is not None else unused_mask(env, tried.infos)
-        return replace(info, unused_mask=unused, unrepeated=tried.unrepeated, largest_byte=tried.largest_byte)
+        return replace(info, unused_mask=unused, unrepeated=tried.unrepeated, largest=tried.largest)
     finally:
         close_env(env)
 

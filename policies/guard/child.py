@@ -136,7 +136,7 @@ def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str
         "unused_mask": info.unused_mask,
         "is_flattened": info.is_flattened,
         "unrepeated": info.unrepeated,
-        "largest_byte": info.largest_byte,
+        "largest": info.largest,
     }
 
 

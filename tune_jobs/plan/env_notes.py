@@ -29,6 +29,8 @@ _MOST_CHANNELS = 16
 _LONG_EPISODE_S = 60.0
 _FEW_TIMES = 20
 """How many times what is seen the space allows, from where that is told: MiniGrid's numbers are up to 10 of 255."""
+_LARGE = 10.0
+"""Decision 58."""
 _FEW_NUMBERS = 3_000
 """An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
 
@@ -51,26 +53,40 @@ def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.
         yield f"Convolutions go over the first two dimensions of images. {hint}"
-    if note := _note_on_bytes(spec, env, seen):
+    if note := _note_on_sizes(spec, env, seen):
         yield note
 
 
-def _note_on_bytes(spec: SweepSpec, env: EnvInfo, seen: gym.Space[Any]) -> str | None:
-    """Return a note on images whose bytes are all but zero once they are divided by what they may be; None: none is."""
+def _note_on_sizes(spec: SweepSpec, env: EnvInfo, seen: gym.Space[Any]) -> str | None:
+    """Return a note on numbers that are too large for networks, or next to nothing for them; None: they are neither."""
     name = "normalize_observations"
-    if env.largest_byte is None or spec.rl_module is not None or spec.algorithm in BASELINES:
+    if env.largest is None or spec.rl_module is not None or spec.algorithm in BASELINES:
         return None
     if name in spec.space or spec.hyperparams.get(name):
         return None
+    largest = abs(env.largest.value)
+    if not (env.observes_images and seen.dtype == np.uint8):
+        if largest < _LARGE:
+            return None
+        return (
+            f"The first observation of {env.env_id} has numbers as large as {_short(env.largest.value)} "
+            f"({env.largest.place}): networks learn little from numbers that are far from 1. "
+            f"hyperparams.{name}: true brings all to that size."
+        )
     assert isinstance(seen, gym.spaces.Box)
     highest = int(seen.high.max())
-    if not 0 < env.largest_byte <= highest / _FEW_TIMES:
+    if not 0 < largest <= highest / _FEW_TIMES:
         return None
     return (
-        f"The first images of {env.env_id} have numbers of up to {env.largest_byte}, and its space allows {highest}: "
+        f"The first image of {env.env_id} has numbers of up to {largest:g}, and its space allows {highest}: "
         f"divided by {highest}, as images of bytes are, they are next to nothing for a network. hyperparams.{name}: "
         "true brings them to a usual size; so does a space that says what they are."
     )
+
+
+def _short(value: float) -> str:
+    """Return a number of at least 10 in few digits: 41,250, -300.5, 1e+09."""
+    return f"{value:,.0f}" if 1_000 <= abs(value) < 1_000_000_000 else f"{value:.4g}"
 
 
 def _on_actions(env: EnvInfo) -> Iterator[str]:
