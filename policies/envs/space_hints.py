@@ -72,6 +72,13 @@ def image_alone_hint(env_id: str, keys: tuple[Any, ...]) -> str:
     return f"{_HOW}: `{alone}` observes the image alone."
 
 
+def smaller_rewards_hint(env_id: str, reward: float) -> str:
+    """Suggest what makes rewards of a size, without sign, of about 1."""
+    by = 10 ** max(1, round(math.log10(reward)))
+    divided = f"gymnasium.wrappers.TransformReward({_make(env_id)}, lambda reward: reward / {by})"
+    return f"{_HOW}: `{divided}` makes them smaller, in evaluations too."
+
+
 def _number(value: Any) -> str:
     return str(value.item()).replace("inf", "numpy.inf")
 

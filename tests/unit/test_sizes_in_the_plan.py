@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 from policy_factory import registered
 
+from policies.envs import modules
 from policies.envs.first_step import Largest
 from policies.envs.make import check_env
 from policies.guard import guarded
+from policies.packed.envs.make import StepTime, measure_step
 from tests.narrowing import present
+from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.env_notes import env_notes
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.spec.file import load_spec
 
 pytestmark = pytest.mark.usefixtures("env_plugin")
@@ -136,3 +141,67 @@ def test_numbers_of_a_usual_size_are_not_told(prices: str) -> None:
     assert notes(prices, {"price": 9.9}, **PLAIN) == []
     for env_id in ("CartPole-v1", "Acrobot-v1", "Pendulum-v1", "LunarLander-v3", "FrozenLake-v1", "HalfCheetah-v5"):
         assert notes(env_id, {}, **PLAIN) == []
+
+
+class Costs(Prices):
+    """Each step costs something."""
+
+    def __init__(self, cost: float = -300.0) -> None:
+        super().__init__(1.0)
+        self.cost = cost
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self._seen(), self.cost, True, False, {}
+
+
+@pytest.fixture
+def costs() -> Iterator[str]:
+    with registered("TestCosts-v0", Costs):
+        yield "TestCosts-v0"
+
+
+def on_rewards(reward: float | None, algorithm: str = "dqn", env_id: str = "CartPole-v1") -> list[str]:
+    spec = load_spec({"env": {"id": env_id}, "algorithm": algorithm})
+    packs = PackPlan(1, 1, 1.0, 0.0, (), "scalar", 5.0, 0, reward=reward)
+    return [note for note in env_notes(spec, check_env(env_id, {}), packs) if "eward" in note]
+
+
+@pytest.mark.parametrize(
+    ("reward", "shown", "by"), [(300.0, "300", 100), (5.0, "5", 10), (20_000.0, "20,000", 10_000), (40.0, "40", 100)]
+)
+def test_dqn_is_told_of_large_rewards_with_what_divides_them(reward: float, shown: str, by: int) -> None:
+    (note,) = on_rewards(reward)
+    assert note.startswith(
+        f"Rewards of CartPole-v1 are of about {shown} a step: DQN's values begin near 0, and come late"
+    )
+    assert note.endswith(" makes them smaller, in evaluations too. PPO hardly minds, and has normalize_rewards.")
+    env = eval(note.split("`")[1], {"gymnasium": gym})
+    env.reset(seed=0)
+    assert env.step(0)[1] == 1.0 / by
+    assert on_rewards(reward, "ppo") == []
+
+
+def test_dqn_is_not_told_of_usual_rewards() -> None:
+    for reward in (4.9, 0.0, None):
+        assert on_rewards(reward) == []
+    spec = load_spec({"env": "CartPole-v1", "algorithm": "dqn"})
+    assert env_notes(spec, check_env("CartPole-v1", {})) == []
+
+
+def test_how_large_rewards_are_is_measured_with_how_long_a_step_takes(
+    costs: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert measure_step(costs, {"cost": -300.0}).reward == 300.0
+    # Every third of random play's is -10, that of a move that is not possible.
+    assert guarded.measure_step("Taxi-v3", {}).reward == 1.0
+    assert measure_step("CartPole-v1", {}).reward is None
+    monkeypatch.setattr(modules, "_allowed", {"hostile_envs"})
+    assert measure_step("hostile_envs:Hostile", {"how": "fail", "where": "step"}) == StepTime(None)
+
+
+def test_the_plan_of_packs_tells_of_rewards(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = StepTime(5.0, reward=300.0)
+    monkeypatch.setattr(guarded, "measure_step", lambda env_id, env_args, *, timeout_s: told)
+    plan = make_plan(load_spec({"env": "CartPole-v1", "algorithm": "dqn"}), Machine(2, 0))
+    assert [note for note in plan.notes if "Rewards of CartPole-v1 are of about 300 a step" in note]
+    assert SweepPlan.from_json(plan.to_json()).notes == plan.notes

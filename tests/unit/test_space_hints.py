@@ -196,7 +196,9 @@ def test_the_wrapper_that_a_plan_names_observes_the_image_alone(
     del gym.registry["Odd-v0"]
     gym.register("Odd-v0", cast("Any", lambda: Odd(observations, spaces.Discrete(2))))
     spec = load_spec({"env": "Odd-v0", "algorithm": "ppo"})
-    of_vectors, of_image = env_notes(spec, check_env("Odd-v0", None, "ppo"))
+    # That bytes in vectors are large is told besides.
+    of_vectors, of_image, of_sizes = env_notes(spec, check_env("Odd-v0", None, "ppo"))
+    assert "normalize_observations" in of_sizes
     assert "are made vectors of shape" in of_vectors
     assert of_image.startswith(f"{size} numbers of these vectors are those of an image, {place}:")
     (expression,) = re.findall("`(.+?)`", of_image)
@@ -222,7 +224,8 @@ def test_of_what_is_no_large_image_nothing_is_said(
     monkeypatch.setitem(gym.registry, "Odd-v0", None)
     del gym.registry["Odd-v0"]
     gym.register("Odd-v0", cast("Any", lambda: Odd(observations, spaces.Discrete(2))))
-    (note,) = env_notes(load_spec({"env": "Odd-v0", "algorithm": "ppo"}), check_env("Odd-v0", None, "ppo"))
+    notes = env_notes(load_spec({"env": "Odd-v0", "algorithm": "ppo"}), check_env("Odd-v0", None, "ppo"))
+    (note,) = [note for note in notes if "normalize_observations" not in note]
     assert "are made vectors of shape" in note
 
 

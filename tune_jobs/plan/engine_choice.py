@@ -59,6 +59,8 @@ class PackPlan:
     """Processes that step environments for one pack; 0: the pack's own process steps them."""
     notes: tuple[str, ...] = ()
     """Notes on why there are fewer packs or slots than CPUs would allow."""
+    reward: float | None = None
+    """How large rewards are in random play; see `policies.packed.envs.make.StepTime`."""
     why_env_kind: str = ""
     """The reason for `env_kind`, as a phrase."""
 

@@ -17,8 +17,9 @@ from policies.envs.flat import FlatBox, leaves, named
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices, is_made
-from policies.envs.space_hints import image_alone_hint
+from policies.envs.space_hints import image_alone_hint, smaller_rewards_hint
 from policies.errors import shortened
+from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.env_checks import channels_hint
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -29,15 +30,17 @@ _MOST_CHANNELS = 16
 _LONG_EPISODE_S = 60.0
 _FEW_TIMES = 20
 """How many times what is seen the space allows, from where that is told: MiniGrid's numbers are up to 10 of 255."""
-_LARGE = 10.0
+_LARGE, _LARGE_REWARD = 10.0, 5.0
 """Decision 58."""
 _FEW_NUMBERS = 3_000
 """An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
 
 
-def env_notes(spec: SweepSpec, env: EnvInfo, step_us: float | None = None) -> list[str]:
-    """Return notes on a sweep's environment, with its wrappers; `step_us` is how long an env step takes, if known."""
-    return [*_on_observations(spec, env), *_on_actions(env), *_on_episodes(spec, env, step_us)]
+def env_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None = None) -> list[str]:
+    """Return notes on a sweep's environment, with its wrappers; `packs`, if some are planned, say what was measured."""
+    reward, step_us = (None, None) if packs is None else (packs.reward, packs.env_step_us)
+    on_rewards = _on_rewards(spec, env, reward)
+    return [*_on_observations(spec, env), *_on_actions(env), *on_rewards, *_on_episodes(spec, env, step_us)]
 
 
 def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
@@ -85,7 +88,7 @@ def _note_on_sizes(spec: SweepSpec, env: EnvInfo, seen: gym.Space[Any]) -> str |
 
 
 def _short(value: float) -> str:
-    """Return a number of at least 10 in few digits: 41,250, -300.5, 1e+09."""
+    """Return a large number in few digits: 41,250, -300.5, 1e+09."""
     return f"{value:,.0f}" if 1_000 <= abs(value) < 1_000_000_000 else f"{value:.4g}"
 
 
@@ -102,6 +105,15 @@ def _on_actions(env: EnvInfo) -> Iterator[str]:
         yield (
             f"{env.env_id} gives {env.unused_mask.place}, which seems to say which actions are allowed, and which is "
             f"not used: env.action_mask: {env.unused_mask.setting} uses it."
+        )
+
+
+def _on_rewards(spec: SweepSpec, env: EnvInfo, reward: float | None) -> Iterator[str]:
+    if spec.algorithm == "dqn" and reward is not None and reward >= _LARGE_REWARD:
+        yield (
+            f"Rewards of {env.env_id} are of about {_short(reward)} a step: DQN's values begin near 0, and come late "
+            f"or never to sums of such rewards. {smaller_rewards_hint(env.env_id, reward)} PPO hardly minds, and has "
+            "normalize_rewards."
         )
 
 

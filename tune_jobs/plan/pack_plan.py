@@ -76,6 +76,7 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack]
         env_step_us=choice.step_us,
         num_env_processes=num_processes,
         notes=notes,
+        reward=step.reward,
         why_env_kind=choice.why,
     )
 

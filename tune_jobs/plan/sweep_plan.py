@@ -365,7 +365,7 @@ def _largest(
 
 def _notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None, concurrent: int) -> list[str]:
     """Return notes on the sweep; `concurrent` is how many trials run at once."""
-    notes = [*repeated_points_notes(spec), *env_notes(spec, env, None if packs is None else packs.env_step_us)]
+    notes = [*repeated_points_notes(spec), *env_notes(spec, env, packs)]
     wanted = spec.resources.max_concurrent
     if wanted is not None and packs is None and concurrent < min(wanted, num_points_of(spec) * spec.seeds_per_point):
         notes.append(f"resources.max_concurrent is {wanted}, but only {counted(concurrent, 'trial')} can run at once.")

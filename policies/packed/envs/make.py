@@ -49,6 +49,8 @@ class StepTime:
     """Microseconds per env step, including resets after episodes' ends; None: the env raised an error before."""
     is_vectorised: bool = False
     """Whether one object steps all of a pack's environments at once."""
+    reward: float | None = None
+    """How large rewards are, without signs: the median over steps of random play; None: it was not looked at."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
     if rows is not None:
         rows.close()
         return StepTime(_vectorised_step_us(env_id, env_args), is_vectorised=True)
-    return StepTime(_scalar_step_us(env_id, env_args))
+    return _scalar_step_time(env_id, env_args)
 
 
 def choose_kind(step: StepTime, *, spare_cpus: int, why_none: str = "no CPU is idle") -> EnvChoice:
@@ -188,12 +190,17 @@ def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> floa
     return 1e6 * seconds / (num_steps * num_envs)
 
 
-def _scalar_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> float | None:
+def _scalar_step_time(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
     """Return the time of a step with random actions; the first, which may load files, counts only if it is alone."""
-    moments = [time.perf_counter() for _ in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
-    if len(moments) == 2:
-        return 1e6 * (moments[1] - moments[0])
-    return 1e6 * (moments[-1] - moments[1]) / (len(moments) - 2) if len(moments) > 2 else None
+    told = [(time.perf_counter(), abs(seen.reward)) for seen in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
+    if len(told) < 2:
+        return StepTime(None)
+    moments = [moment for moment, _ in told]
+    us = 1e6 * (moments[1] - moments[0])
+    if len(moments) > 2:
+        us = 1e6 * (moments[-1] - moments[1]) / (len(moments) - 2)
+    # The first is no step's.
+    return StepTime(us, reward=float(np.median([reward for _, reward in told[1:]])))
 
 
 class _Seen(NamedTuple):
