@@ -67,6 +67,8 @@ def listed_mask(actions: Any, size: int, first: int) -> NDArray[np.float32]:
         raise MaskProblemError("which forbids every action")
     if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
         raise MaskProblemError(f"not a list of actions, which are numbers from {first} to {first + size - 1}")
+    # Small numbers of another start may overflow otherwise.
+    numbers = numbers.astype(np.int64)
     outside = numbers[(numbers < first) | (numbers >= first + size)]
     if outside.size:
         raise MaskProblemError(f"and {outside[0]} is no action: they are numbers from {first} to {first + size - 1}")

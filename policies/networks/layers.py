@@ -189,8 +189,8 @@ class ObservationStatistics:
         num_new = len(observations)
         if not self._normalizes or num_new == 0:
             return
-        batch = self._unmasked(torch.as_tensor(observations, device=self.obs_mean.device)).double()
-        batch *= self._observation_scale
+        batch = self._unmasked(torch.as_tensor(observations, device=self.obs_mean.device))
+        batch = batch.double() * self._observation_scale
         mean = batch.mean(dim=0)
         count = int(self.obs_count)
         total = count + num_new

@@ -146,6 +146,14 @@ def test_what_lists_actions(actions: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    ("actions", "first"), [(np.array([100, -100], np.int8), -100), (np.array([0, 200], np.uint8), 0)]
+)
+def test_small_whole_numbers_list_actions_of_any_start(actions: Any, first: int) -> None:
+    mask = listed_mask(actions, 201, first)
+    assert np.flatnonzero(mask).tolist() == [0, 200]
+
+
+@pytest.mark.parametrize(
     ("actions", "words"),
     [
         ([], "which forbids every action"),
