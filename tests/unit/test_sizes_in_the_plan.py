@@ -160,6 +160,42 @@ def costs() -> Iterator[str]:
         yield "TestCosts-v0"
 
 
+class Returns(Prices):
+    """Observes by how much a price has changed."""
+
+    def __init__(self, change: float = 0.012) -> None:
+        super().__init__(1.0)
+        self.change = change
+
+    def _seen(self) -> Any:
+        return np.array([0.001, -self.change, 0.0], np.float32)
+
+
+@pytest.mark.parametrize(("change", "is_told"), [(0.012, True), (0.099, True), (0.1, False), (2.0, False)])
+def test_small_numbers_in_all_of_random_play_are_told(change: float, *, is_told: bool) -> None:
+    with registered("TestReturns-v0", Returns):
+        step = measure_step("TestReturns-v0", {"change": change})
+        assert step.largest == pytest.approx(change)
+        packs = PackPlan(1, 1, 1.0, 0.0, (), "scalar", 5.0, 0, largest=step.largest)
+        env = {"id": "TestReturns-v0", "args": {"change": change}}
+        info = check_env("TestReturns-v0", {"change": change})
+        told = env_notes(load_spec({"env": env, "algorithm": "ppo"}), info, packs)
+        words = (
+            "No number that TestReturns-v0 observes in random play is as far from 0 as 0.1: the largest is "
+            f"{change:.2g}, and networks hardly tell such numbers apart. hyperparams.normalize_observations: true "
+            "brings all to a usual size."
+        )
+        assert told == ([words] if is_told else [])
+        normalised = {"env": env, "algorithm": "ppo", "hyperparams": {"normalize_observations": True}}
+        assert env_notes(load_spec(normalised), info, packs) == []
+
+
+def test_the_largest_number_of_random_play_is_behind_the_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    inner: Any = gym.make("TestShades-v0").unwrapped
+    monkeypatch.setattr(type(inner), "_observation", lambda self: np.zeros((12, 9, 2), np.uint8))
+    assert measure_step("TestMaskedShades-v0", {}).largest == 0.0
+
+
 def on_rewards(reward: float | None, algorithm: str = "dqn", env_id: str = "CartPole-v1") -> list[str]:
     spec = load_spec({"env": {"id": env_id}, "algorithm": algorithm})
     packs = PackPlan(1, 1, 1.0, 0.0, (), "scalar", 5.0, 0, reward=reward)
@@ -200,8 +236,9 @@ def test_how_large_rewards_are_is_measured_with_how_long_a_step_takes(
 
 
 def test_the_plan_of_packs_tells_of_rewards(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = StepTime(5.0, reward=300.0)
+    told = StepTime(5.0, reward=300.0, largest=0.05)
     monkeypatch.setattr(guarded, "measure_step", lambda env_id, env_args, *, timeout_s: told)
     plan = make_plan(load_spec({"env": "CartPole-v1", "algorithm": "dqn"}), Machine(2, 0))
     assert [note for note in plan.notes if "Rewards of CartPole-v1 are of about 300 a step" in note]
+    assert [note for note in plan.notes if "the largest is 0.05" in note]
     assert SweepPlan.from_json(plan.to_json()).notes == plan.notes

@@ -61,6 +61,8 @@ class PackPlan:
     """Notes on why there are fewer packs or slots than CPUs would allow."""
     reward: float | None = None
     """How large rewards are in random play; see `policies.packed.envs.make.StepTime`."""
+    largest: float | None = None
+    """How large what is observed is there."""
     why_env_kind: str = ""
     """The reason for `env_kind`, as a phrase."""
 

@@ -11,16 +11,16 @@ import numpy as np
 from gymnasium.spaces.utils import flatdim
 
 from analysis.wording import counted, duration
-from policies.acting.baselines import BASELINES
 from policies.acting.evaluate import MAX_EPISODE_STEPS
 from policies.envs.flat import FlatBox, leaves, named
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices, is_made
-from policies.envs.space_hints import image_alone_hint, smaller_rewards_hint
+from policies.envs.space_hints import image_alone_hint
 from policies.errors import shortened
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.env_checks import channels_hint
+from tune_jobs.plan.size_notes import size_notes
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _IMAGE = 3
@@ -28,19 +28,15 @@ _IMAGE = 3
 _MOST_CHANNELS = 16
 """Of an image: four frames in colour. NetHack's texts are of three dimensions, too, none of which is as small."""
 _LONG_EPISODE_S = 60.0
-_FEW_TIMES = 20
-"""How many times what is seen the space allows, from where that is told: MiniGrid's numbers are up to 10 of 255."""
-_LARGE, _LARGE_REWARD = 10.0, 5.0
-"""Decision 58."""
 _FEW_NUMBERS = 3_000
 """An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
 
 
 def env_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None = None) -> list[str]:
     """Return notes on a sweep's environment, with its wrappers; `packs`, if some are planned, say what was measured."""
-    reward, step_us = (None, None) if packs is None else (packs.reward, packs.env_step_us)
-    on_rewards = _on_rewards(spec, env, reward)
-    return [*_on_observations(spec, env), *_on_actions(env), *on_rewards, *_on_episodes(spec, env, step_us)]
+    step_us = None if packs is None else packs.env_step_us
+    sizes = size_notes(spec, env, packs)
+    return [*_on_observations(spec, env), *sizes, *_on_actions(env), *_on_episodes(spec, env, step_us)]
 
 
 def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
@@ -56,40 +52,6 @@ def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.
         yield f"Convolutions go over the first two dimensions of images. {hint}"
-    if note := _note_on_sizes(spec, env, seen):
-        yield note
-
-
-def _note_on_sizes(spec: SweepSpec, env: EnvInfo, seen: gym.Space[Any]) -> str | None:
-    """Return a note on numbers that are too large for networks, or next to nothing for them; None: they are neither."""
-    name = "normalize_observations"
-    if env.largest is None or spec.rl_module is not None or spec.algorithm in BASELINES:
-        return None
-    if name in spec.space or spec.hyperparams.get(name):
-        return None
-    largest = abs(env.largest.value)
-    if not (env.observes_images and seen.dtype == np.uint8):
-        if largest < _LARGE:
-            return None
-        return (
-            f"The first observation of {env.env_id} has numbers as large as {_short(env.largest.value)} "
-            f"({env.largest.place}): networks learn little from numbers that are far from 1. "
-            f"hyperparams.{name}: true brings all to that size."
-        )
-    assert isinstance(seen, gym.spaces.Box)
-    highest = int(seen.high.max())
-    if not 0 < largest <= highest / _FEW_TIMES:
-        return None
-    return (
-        f"The first image of {env.env_id} has numbers of up to {largest:g}, and its space allows {highest}: "
-        f"divided by {highest}, as images of bytes are, they are next to nothing for a network. hyperparams.{name}: "
-        "true brings them to a usual size; so does a space that says what they are."
-    )
-
-
-def _short(value: float) -> str:
-    """Return a large number in few digits: 41,250, -300.5, 1e+09."""
-    return f"{value:,.0f}" if 1_000 <= abs(value) < 1_000_000_000 else f"{value:.4g}"
 
 
 def _on_actions(env: EnvInfo) -> Iterator[str]:
@@ -105,15 +67,6 @@ def _on_actions(env: EnvInfo) -> Iterator[str]:
         yield (
             f"{env.env_id} gives {env.unused_mask.place}, which seems to say which actions are allowed, and which is "
             f"not used: env.action_mask: {env.unused_mask.setting} uses it."
-        )
-
-
-def _on_rewards(spec: SweepSpec, env: EnvInfo, reward: float | None) -> Iterator[str]:
-    if spec.algorithm == "dqn" and reward is not None and reward >= _LARGE_REWARD:
-        yield (
-            f"Rewards of {env.env_id} are of about {_short(reward)} a step: DQN's values begin near 0, and come late "
-            f"or never to sums of such rewards. {smaller_rewards_hint(env.env_id, reward)} PPO hardly minds, and has "
-            "normalize_rewards."
         )
 
 

@@ -77,6 +77,7 @@ def plan_packs(spec: SweepSpec, machine: Machine, members: Sequence[TrialToPack]
         num_env_processes=num_processes,
         notes=notes,
         reward=step.reward,
+        largest=step.largest,
         why_env_kind=choice.why,
     )
 

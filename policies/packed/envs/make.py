@@ -51,6 +51,8 @@ class StepTime:
     """Whether one object steps all of a pack's environments at once."""
     reward: float | None = None
     """How large rewards are, without signs: the median over steps of random play; None: it was not looked at."""
+    largest: float | None = None
+    """The number farthest from 0 that networks would have seen in it, without its sign; None: it was not looked at."""
 
 
 @dataclass(frozen=True)
@@ -114,13 +116,13 @@ def measure_step(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
     from policies.packed.envs.cartpole_rows import CartPoleRows
 
     env = make_env(env_id, env_args)
-    may_have_rows = is_classic(env)
+    may_have_rows, behind_mask = is_classic(env), num_masked(env.observation_space)
     close_env(env)
     rows = (CartPoleRows.make(env_id, env_args) or ClassicRows.make(env_id, env_args)) if may_have_rows else None
     if rows is not None:
         rows.close()
         return StepTime(_vectorised_step_us(env_id, env_args), is_vectorised=True)
-    return _scalar_step_time(env_id, env_args)
+    return _scalar_step_time(env_id, env_args, behind_mask)
 
 
 def choose_kind(step: StepTime, *, spare_cpus: int, why_none: str = "no CPU is idle") -> EnvChoice:
@@ -190,17 +192,19 @@ def _vectorised_step_us(env_id: str, env_args: Mapping[str, Any] | None) -> floa
     return 1e6 * seconds / (num_steps * num_envs)
 
 
-def _scalar_step_time(env_id: str, env_args: Mapping[str, Any] | None) -> StepTime:
+def _scalar_step_time(env_id: str, env_args: Mapping[str, Any] | None, behind_mask: int) -> StepTime:
     """Return the time of a step with random actions; the first, which may load files, counts only if it is alone."""
-    told = [(time.perf_counter(), abs(seen.reward)) for seen in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
+    told = [(time.perf_counter(), seen) for seen in _trace(env_id, env_args, 0, seconds=_TIMED_S)]
     if len(told) < 2:
         return StepTime(None)
     moments = [moment for moment, _ in told]
     us = 1e6 * (moments[1] - moments[0])
     if len(moments) > 2:
         us = 1e6 * (moments[-1] - moments[1]) / (len(moments) - 2)
+    largest = max(np.abs(np.ravel(seen.observation)[behind_mask:].astype(np.float64)).max() for _, seen in told)
     # The first is no step's.
-    return StepTime(us, reward=float(np.median([reward for _, reward in told[1:]])))
+    reward = np.median([abs(seen.reward) for _, seen in told[1:]])
+    return StepTime(us, reward=float(reward), largest=float(largest))
 
 
 class _Seen(NamedTuple):
