@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from policies.acting import load
 from policies.arguments import checked
-from tune_jobs.store.names import SWEEP_RECORD
+from policies.errors import NotFoundError
 from tune_jobs.store.urls import is_url
 
 if TYPE_CHECKING:
@@ -30,11 +30,25 @@ def load_policy(path: str | Path) -> Policy:
         SpecError: It needs a class from a module that is not allowed, or the URL is wrong.
         CannotRunError: The object store cannot be read.
     """
-    if not is_url(path) and not Path(path, SWEEP_RECORD).is_file():
-        return load.load_policy(path)
+    if not is_url(path):
+        try:
+            return load.load_policy(path)
+        except NotFoundError:
+            if not _is_sweep(Path(path)):
+                raise
     from tune_jobs.sweeps.sources import find_sweep
 
     store = find_sweep(path)
     # With a hint if there is none.
     store.read_best()
     return load.load_policy(store.best_folder)
+
+
+def _is_sweep(path: Path) -> bool:
+    if not path.is_dir():
+        return False
+    try:
+        from tune_jobs.store.opening import open_sweep
+    except ImportError:  # where only what acting needs is installed
+        return False
+    return open_sweep(path.absolute()).exists()
