@@ -63,6 +63,23 @@ def network_from_weights(
     return network
 
 
+def check_scale(space: gym.Space[Any], saved: PolicyNetwork) -> None:
+    """Check that what networks see of a space is what they saw when a network was saved.
+
+    Former versions divided images of bytes by 255 whatever their space said.
+
+    Raises:
+        CheckpointError: It is something else. A network of the user's own scales for itself.
+    """
+    now = observation_scale(space)
+    if saved.module is None and saved.scale != now:
+        raise CheckpointError(
+            f"It was trained on images of bytes times {saved.scale:.6g}, and this version multiplies them by "
+            f"{now:.6g}.",
+            "Launch the sweep anew; its policies act as before.",
+        )
+
+
 def _check_sizes(network: PolicyNetwork, hyperparams: TrainedHyperparams, weights: Weights, encoder: str) -> None:
     """Check that the network of the weights is the one that the hyperparameters describe, and not a larger one."""
     num_layers = sum(name.startswith(f"{encoder}.") and name.endswith(".weight") for name in weights)

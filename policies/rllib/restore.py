@@ -20,7 +20,7 @@ from ray.rllib.core import DEFAULT_MODULE_ID
 from policies.acting.policy import action_transform
 from policies.errors import CheckpointError, TuneJobsError
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
-from policies.networks.portable_weights import network_from_weights, normalization_in
+from policies.networks.portable_weights import check_scale, network_from_weights, normalization_in
 from policies.networks.rl_modules import RL_MODULE_KEY, import_module_class
 from policies.portable.file import (
     ModuleWeights,
@@ -208,9 +208,12 @@ def check_weights(algorithm: Algorithm, expected: PolicyNetwork) -> None:
     """Check that an Algorithm's learner and its env runner have exactly a network's weights.
 
     Raises:
-        CheckpointError: They differ.
+        CheckpointError: They differ, or networks see observations times another factor.
     """
-    sources = {source: module.get_state() for source, module in _modules(algorithm).items()}
+    modules = _modules(algorithm)
+    for module in modules.values():
+        check_scale(module.observation_space, expected)
+    sources = {source: module.get_state() for source, module in modules.items()}
     for source, weights in sources.items():
         held = {np.asarray(value).tobytes() for value in weights.values()}
         if "obs_mean" in weights:

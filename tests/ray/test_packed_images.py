@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from trials import make_task, run_trial, train_pack
 from policies.acting.evaluate import Evaluator
 from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
+from policies.errors import CheckpointError
 from policies.packed.state import load_member, save_member
 from policies.portable.file import save_policy
 from tests.narrowing import present
@@ -229,6 +231,32 @@ def test_a_trial_of_rllibs_learns_to_look_at_what_has_a_mask(algorithm: str, tmp
             image, reward, *_ = env.step(policy.act(image, inner.action_masks()))
             total += float(reward)
     assert total / len(SEEDS) >= LEARNED
+
+
+def test_a_checkpoint_of_images_that_were_scaled_otherwise_does_not_go_on(tmp_path: Path) -> None:
+    from policies.packed.to_rllib import algorithm_from_checkpoint
+    from tune_jobs.training.packed import PackedEngine
+
+    engine, folder = PackedEngine(), tmp_path / "000001"
+    engine.add(task := task_of(tmp_path, "ppo", 0, BITS), None)
+    engine.train_iteration()
+    policy = engine.policy(task.trial_id)
+    engine.save(task.trial_id, folder)
+    engine.close()
+    save_policy(policy, folder)
+    engine = PackedEngine()
+    engine.add(task, folder)
+    engine.close()
+    # As a former version wrote it, which divided all bytes by 255.
+    save_policy(replace(policy, network=replace(policy.network, scale=1 / 255)), folder)
+    words = "trained on images of bytes times 0.00392157, and this version multiplies them by 1"
+    engine = PackedEngine()
+    with pytest.raises(CheckpointError, match=words) as caught:
+        engine.add(task, folder)
+    assert caught.value.hint.startswith("Launch the sweep anew")
+    engine.close()
+    with pytest.raises(CheckpointError, match=words):
+        algorithm_from_checkpoint(folder)
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])

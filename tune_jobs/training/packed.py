@@ -70,7 +70,7 @@ class PackedEngine:
             member = new_member(task.trial_id, hyperparams, task.seed, space, action_space)
             env_seed, before = task.seed, (0, 0)
             if checkpoint is not None:
-                member = restored_member(member, checkpoint, task)
+                member = restored_member(member, checkpoint, task, space)
                 if task.changes:
                     before = (task.num_env_steps - member.num_env_steps, task.num_iterations - member.num_iterations)
                 # Other seeds than at the trial's start, because its environments begin new episodes.

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
 
 from policies import random_streams
+from policies.envs.spaces import observation_dtype
 from policies.errors import CheckpointError
+from policies.networks.portable_weights import check_scale
 from policies.packed.member import AnyMember
 from policies.packed.state import STATE_FOLDER, check_shapes, load_member
+from policies.portable.file import read_policy
 from tune_jobs.store.names import TRIAL_RECORD
 from tune_jobs.training.protocol import TrialTask
 
 
-def restored_member(fresh: AnyMember, checkpoint: Path, task: TrialTask) -> AnyMember:
+def restored_member(fresh: AnyMember, checkpoint: Path, task: TrialTask, space: gym.Space[Any]) -> AnyMember:
     """Return the member that a trial goes on with from a checkpoint.
 
     In a population the checkpoint may be another trial's, or have values from before a change. Weights, target
@@ -24,9 +31,11 @@ def restored_member(fresh: AnyMember, checkpoint: Path, task: TrialTask) -> AnyM
         fresh: A new member of the trial.
         checkpoint: The checkpoint's folder, whose files were verified.
         task: The trial, with the iterations that it has done.
+        space: What is observed.
 
     Raises:
-        CheckpointError: The checkpoint is damaged, or is not the trial's, or has other networks.
+        CheckpointError: The checkpoint is damaged, or is not the trial's, or has other networks, or networks that saw
+            images times another factor.
     """
     folder = checkpoint / STATE_FOLDER
     if not folder.is_dir():
@@ -42,6 +51,8 @@ def restored_member(fresh: AnyMember, checkpoint: Path, task: TrialTask) -> AnyM
             f"Restore {TRIAL_RECORD}, or use another checkpoint of the trial.",
         )
     check_shapes(member, fresh.weights)
+    if observation_dtype(space) == np.uint8:
+        check_scale(space, read_policy(checkpoint).network)
     if is_own:
         return member
     rng = random_streams.member_draws_after(task.seed, task.num_iterations)
