@@ -17,14 +17,19 @@ ACTIONS = "actions"
 Setting: TypeAlias = str | bool | Mapping[str, str] | None
 
 
+def is_setting(value: Any) -> bool:
+    """Whether something is a name, {actions: a name}, true, false or None."""
+    name = value[ACTIONS] if isinstance(value, Mapping) and set(value) == {ACTIONS} else value
+    return value is None or isinstance(value, bool) or (isinstance(name, str) and bool(name))
+
+
 def check_setting(setting: Any) -> Setting:
     """Return what an environment's arguments say of its mask.
 
     Raises:
         EnvError: It is neither a name, nor {actions: a name}, nor true or false.
     """
-    name = setting[ACTIONS] if isinstance(setting, Mapping) and set(setting) == {ACTIONS} else setting
-    if (isinstance(name, str) and name) or setting is None or isinstance(setting, bool):
+    if is_setting(setting):
         return cast("Setting", setting)
     raise EnvError(
         f"{ACTION_MASK} is {setting!r}; it must be the name of the mask, {{{ACTIONS}: the name of a list of the "

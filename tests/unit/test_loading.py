@@ -66,6 +66,14 @@ def test_a_sweeps_best_is_loaded_by_its_folder(tmp_path: Path, monkeypatch: pyte
         tune_jobs.load_policy(tmp_path)
 
 
+def test_without_what_opens_sweeps_a_folder_that_holds_no_policy_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "tune_jobs.store.opening", None)
+    with pytest.raises(NotFoundError, match="There is no policy file"):
+        tune_jobs.load_policy(tmp_path)
+
+
 def test_a_file_is_loaded_without_ray_torch_or_what_asks_an_object_store(tmp_path: Path) -> None:
     save_policy(make_portable("CartPole-v1"), tmp_path)
     code = (

@@ -246,15 +246,21 @@ def test_images_that_have_to_be_made_first_are_told() -> None:
             assert ("FlattenObservation" in program.code) is (filters is None and flattens)
 
 
-@pytest.mark.parametrize("flattened", [False, True])
-def test_the_programs_of_a_report_take_the_envs_observations(flattened: bool) -> None:
+def programs_of_a_report(**record: Any) -> list[next_steps.Step]:
+    """Those for other libraries, of a sweep whose record says so."""
     made = make_sweep()
-    made.sweep = made.sweep.model_copy(update={"is_flattened": flattened})
+    made.sweep = made.sweep.model_copy(update=record)
     best = setting(0, [made.trials[0].trial_id], 1)
     steps = next_steps.section(source_of(made, settings_of(best))).steps
-    programs = [step.text for step in steps if step.title.startswith("The setting in ")]
+    programs = [step for step in steps if step.title.startswith("The setting in ")]
     assert len(programs) == 2
-    assert ["FlattenObservation" in program for program in programs] == [flattened] * 2
+    return programs
+
+
+@pytest.mark.parametrize("flattened", [False, True])
+def test_the_programs_of_a_report_take_the_envs_observations(flattened: bool) -> None:
+    programs = programs_of_a_report(is_flattened=flattened)
+    assert ["FlattenObservation" in program.text for program in programs] == [flattened] * 2
 
 
 def test_a_sweeps_record_says_whether_observations_are_made_vectors(tmp_path: Path) -> None:
@@ -265,13 +271,8 @@ def test_a_sweeps_record_says_whether_observations_are_made_vectors(tmp_path: Pa
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_the_programs_of_a_report_say_that_they_know_no_mask(masked: bool) -> None:
-    made = make_sweep()
-    made.sweep = made.sweep.model_copy(update={"is_masked": masked})
-    best = setting(0, [made.trials[0].trial_id], 1)
-    steps = next_steps.section(source_of(made, settings_of(best))).steps
-    told = [step.why for step in steps if step.title.startswith("The setting in ")]
-    assert len(told) == 2
-    assert ["MaskablePPO" in why for why in told] == [masked] * 2
+    programs = programs_of_a_report(is_masked=masked)
+    assert ["MaskablePPO" in program.why for program in programs] == [masked] * 2
 
 
 def test_a_sweeps_record_says_whether_actions_are_masked(tmp_path: Path) -> None:

@@ -41,8 +41,8 @@ def size_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None) -> Iterato
             yield from _on_bytes(env.env_id, abs(env.largest.value), int(seen.high.max()))
         else:
             yield from _on_numbers(env.env_id, env.largest, None if packs is None else packs.largest)
-    if spec.algorithm == "dqn" and packs is not None and (packs.reward or 0.0) >= _LARGE_REWARD:
-        yield from _on_rewards(env.env_id, packs.reward or 0.0)
+    if spec.algorithm == "dqn" and packs is not None and packs.reward is not None:
+        yield from _on_rewards(env.env_id, packs.reward)
 
 
 def _on_bytes(env_id: str, largest: float, highest: int) -> Iterator[str]:
@@ -70,10 +70,12 @@ def _on_numbers(env_id: str, first: Largest, played: float | None) -> Iterator[s
 
 
 def _on_rewards(env_id: str, reward: float) -> Iterator[str]:
-    yield (
-        f"Rewards of {env_id} are of about {_short(reward)} a step: DQN's values begin near 0, and come late or never "
-        f"to sums of such rewards. {smaller_rewards_hint(env_id, reward)} PPO hardly minds, and has normalize_rewards."
-    )
+    if reward >= _LARGE_REWARD:
+        yield (
+            f"Rewards of {env_id} are of about {_short(reward)} a step: DQN's values begin near 0, and come late or "
+            f"never to sums of such rewards. {smaller_rewards_hint(env_id, reward)} PPO hardly minds, and has "
+            "normalize_rewards."
+        )
 
 
 def _short(value: float) -> str:

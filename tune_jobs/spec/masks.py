@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from pydantic import Field
 
+from policies.envs.mask_settings import is_setting
 from tune_jobs.spec.fields import NameText, Section
 from tune_jobs.spec.plain_data import yaml_text
 
@@ -23,8 +23,7 @@ def mask_as_given(value: Any) -> Any:
     Raises:
         ValueError: It is none of these.
     """
-    name = value["actions"] if isinstance(value, Mapping) and set(value) == {"actions"} else value
-    if isinstance(value, bool | ListedActions) or value is None or (isinstance(name, str) and name):
+    if isinstance(value, ListedActions) or is_setting(value):
         return value
     raise ValueError(
         f"{yaml_text(value)} is not allowed: it should be a name, {{actions: the name of a list of the actions "
