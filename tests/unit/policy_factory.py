@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy
 from policies.envs.make import check_env
 from policies.portable.file import (
@@ -23,7 +25,27 @@ from policies.portable.file import (
     PolicyNetwork,
     PortablePolicy,
     describe_space,
+    save_policy,
 )
+
+if TYPE_CHECKING:
+    from policies.hyperparams import TrainedHyperparams
+
+
+def untrained_policy(
+    env_id: str, env_args: Mapping[str, Any], hyperparams: TrainedHyperparams, folder: Path
+) -> NetworkPolicy:
+    """That of a new trial of a pack, read from its file in a folder."""
+    from policies.packed.initial import new_member
+    from policies.packed.portable_member import portable_policy
+
+    info = check_env(env_id, env_args)
+    spaces = info.observation_space, info.action_space
+    member = new_member("t0000", hyperparams, 3, *spaces)
+    save_policy(portable_policy(member, *spaces, env_id=env_id, env_args=dict(env_args), training={}), folder)
+    policy = load_policy(folder)
+    assert isinstance(policy, NetworkPolicy)
+    return policy
 
 
 def make_portable(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
+from policy_factory import untrained_policy
 
 from analysis.page.cards import acting_code
 from policies.acting.baselines import ConstantPolicy
@@ -29,9 +30,7 @@ from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperpar
 from policies.packed.envs.make import check_seedable, make_packed_envs, measure_step
 from policies.packed.initial import new_member
 from policies.packed.make import make_stack
-from policies.packed.portable_member import portable_policy
 from policies.packed.sampling import allowed_at, mask_outputs
-from policies.portable.file import save_policy
 
 pytestmark = pytest.mark.usefixtures("env_plugin")
 
@@ -51,15 +50,7 @@ DQN = DQNHyperparams(
 
 def policy_of(hyperparams: TrainedHyperparams, env_args: dict[str, Any], folder: Path) -> NetworkPolicy:
     """One with random weights, from its file."""
-    info = check_env(ENV, env_args)
-    member = new_member("t0000", hyperparams, 3, info.observation_space, info.action_space)
-    portable = portable_policy(
-        member, info.observation_space, info.action_space, env_id=ENV, env_args=env_args, training={}
-    )
-    save_policy(portable, folder)
-    policy = load_policy(folder)
-    assert isinstance(policy, NetworkPolicy)
-    return policy
+    return untrained_policy(ENV, env_args, hyperparams, folder)
 
 
 @pytest.mark.parametrize(("place", "given"), [("observation", ""), ("method", ", mask="), ("info", ", mask=")])

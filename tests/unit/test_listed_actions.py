@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from policy_factory import registered
+from policy_factory import registered, untrained_policy
 
 from analysis.page.cards import acting_code
 from policies.acting.evaluate import evaluate_policy
@@ -27,8 +27,6 @@ from policies.hyperparams import PPOHyperparams
 from policies.packed.envs.make import make_packed_envs
 from policies.packed.initial import new_member
 from policies.packed.make import make_stack
-from policies.packed.portable_member import portable_policy
-from policies.portable.file import save_policy
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sections import EnvSpec
 
@@ -72,16 +70,7 @@ def test_trials_and_evaluations_keep_to_the_list(place: str) -> None:
 
 
 def listing_policy(folder: Path, place: str = "info") -> NetworkPolicy:
-    env_args = LISTS[place]
-    info = check_env(ENV, env_args, "ppo")
-    member = new_member("t0000", PPO, 3, info.observation_space, info.action_space)
-    portable = portable_policy(
-        member, info.observation_space, info.action_space, env_id=ENV, env_args=env_args, training={}
-    )
-    save_policy(portable, folder)
-    policy = load_policy(folder)
-    assert isinstance(policy, NetworkPolicy)
-    return policy
+    return untrained_policy(ENV, LISTS[place], PPO, folder)
 
 
 def test_a_policy_takes_lists_as_the_environment_gives_them(tmp_path: Path) -> None:

@@ -9,19 +9,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from policy_factory import registered
+from policy_factory import registered, untrained_policy
 
 from policies.acting.evaluate import evaluate_policy
-from policies.acting.load import load_policy
 from policies.acting.policy import NetworkPolicy, RandomPolicy
 from policies.envs.make import check_env, make_env, make_vector_env
 from policies.envs.masks import FORBIDDEN, MaskedBox
 from policies.envs.spaces import describe_space, space_from_description
 from policies.errors import EnvError, ObservationError, SpecError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
-from policies.packed.initial import new_member
-from policies.packed.portable_member import portable_policy
-from policies.portable.file import save_policy
 from tune_jobs.plan.env_checks import check_env_rules
 from tune_jobs.plan.estimates import trial_bytes
 from tune_jobs.plan.machine import Machine
@@ -35,16 +31,8 @@ SHAPE, SIZE = (12, 9, 2), 12 * 9 * 2
 FILTERS = ((5, 4, 2), (3, 2, 1))
 
 
-def policy_of(hyperparams: Any, folder: Path, env_args: dict[str, Any] | None = None) -> NetworkPolicy:
-    info = check_env(ENV, env_args)
-    member = new_member("t0000", hyperparams, 3, info.observation_space, info.action_space)
-    portable = portable_policy(
-        member, info.observation_space, info.action_space, env_id=ENV, env_args=env_args or {}, training={}
-    )
-    save_policy(portable, folder)
-    policy = load_policy(folder)
-    assert isinstance(policy, NetworkPolicy)
-    return policy
+def policy_of(hyperparams: Any, folder: Path) -> NetworkPolicy:
+    return untrained_policy(ENV, {}, hyperparams, folder)
 
 
 def test_an_image_is_observed_in_a_row_behind_the_mask() -> None:
