@@ -85,7 +85,7 @@ def stable_baselines3_program(
         wrapper = ", wrapper_class=FlattenObservation"
         imports.insert(0, "from gymnasium.wrappers import FlattenObservation")
     elif flattens:
-        notes.append(_NO_IMAGES)
+        notes += [_NO_IMAGES, "If they are a Dict, MultiInputPolicy takes them, with convolutions of its own."]
     made = f"make_vec_env({env_id!r}, n_envs={values.num_envs}{wrapper}{_env_kwargs('env_kwargs', env_args)})"
     imports += ["from stable_baselines3.common.env_util import make_vec_env"]
     lines = [f"env = {made}"]

@@ -71,7 +71,8 @@ class _Hyperparams(_Frozen):
     conv_filters: tuple[tuple[PositiveInt, PositiveInt, PositiveInt], ...] | None = Field(
         None,
         min_length=1,
-        description="Convolutions before the hidden layers, for images; each is [channels, kernel, stride].",
+        description="Convolutions before the hidden layers, for images, also for one among other members; each is "
+        "[channels, kernel, stride].",
     )
     normalize_observations: bool = Field(
         False, description="Shift and scale observations by their running mean and deviation in training."

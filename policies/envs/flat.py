@@ -131,6 +131,11 @@ class FlatBox(gym.spaces.Box):
         where = np.unravel_index(place - part.start, shape) if shape else ()
         return named((*part.keys, *(int(index) for index in where)))
 
+    def places(self) -> Iterator[tuple[tuple[Any, ...], gym.Space[Any], int, int]]:
+        """Yield the members that have none themselves: their keys, spaces, and where their numbers begin and end."""
+        for part in self._parts:
+            yield part.keys, part.space, part.start, part.end
+
     def _batch(self, observations: Any) -> NDArray[Any]:
         return np.stack([self.flat(one) for one in observations])
 

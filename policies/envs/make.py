@@ -28,6 +28,7 @@ from policies.envs.faults import close_env, hint_on, is_of_env, place_in_env
 from policies.envs.first_step import Largest, check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import as_creator, find_env, normalize_env_id
+from policies.envs.images import SeenImage, image_seen
 from policies.envs.mask_hints import UnusedMask, unused_mask
 from policies.envs.masks import MasksActions, may_be_masked, seen_by_networks
 from policies.envs.mujoco_warnings import say_each_once
@@ -99,6 +100,11 @@ class EnvInfo:
     def observes_images(self) -> bool:
         """Whether observations are images, of shape (rows, columns, channels), and not vectors."""
         return len(seen_by_networks(self.observation_space).shape or ()) == 3
+
+    @property
+    def image(self) -> SeenImage | None:
+        """The image that convolutions can see, as a whole or among other members; None: there is none, or several."""
+        return image_seen(self.observation_space)
 
 
 def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algorithm | None = None) -> EnvInfo:

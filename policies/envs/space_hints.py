@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -70,6 +71,21 @@ def image_alone_hint(env_id: str, keys: tuple[Any, ...]) -> str:
         f"gymnasium.wrappers.TransformObservation({env}, lambda seen: seen{member}, {env}.observation_space{member})"
     )
     return f"{_HOW}: `{alone}` observes the image alone."
+
+
+def one_image_hint(env_id: str, space: gym.Space[Any], images: Sequence[tuple[Any, ...]]) -> str:
+    """Suggest what leaves one image of several, and everything that is none.
+
+    Args:
+        env_id: The env's id.
+        space: The space of its observations, with their mask.
+        images: The keys that lead to each image.
+    """
+    dropped = {keys[0] for keys in images[1:]}
+    if not isinstance(space, gym.spaces.Dict) or any(len(keys) > 1 for keys in images):
+        return image_alone_hint(env_id, images[0])
+    kept = [name for name in space.spaces if name not in dropped]
+    return f"{_HOW}: `gymnasium.wrappers.FilterObservation({_make(env_id)}, {kept})` leaves the other images out."
 
 
 def smaller_rewards_hint(env_id: str, reward: float) -> str:

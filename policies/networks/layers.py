@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from policies.envs.images import image_member, scale_of_bytes
 from policies.envs.masks import FORBIDDEN, num_masked, seen_by_networks
 from policies.errors import SpecError
 from policies.portable.convolution import output_shape
@@ -33,10 +34,13 @@ class Encoder(nn.Module):
     """Convolutions, if any, then dense layers, with the activation after each.
 
     Args:
-        observation_space: Shape (n,), or (height, width, channels) with convolutions.
+        observation_space: What networks see: of shape (n,), or (height, width, channels) with convolutions. With
+            convolutions a vector has one image among the members that it is made of; the rest goes into the dense
+            layers, behind what the convolutions make of the image.
         hidden_sizes: Units of each dense layer.
         activation: A name of `policies.activations.ACTIVATIONS`.
         conv_filters: (channels, kernel, stride) of each convolution, without padding; None: none.
+        normalizes: Whether observations are normalised before.
 
     Attributes:
         conv: The convolutions, or None.
@@ -53,12 +57,16 @@ class Encoder(nn.Module):
         hidden_sizes: Sequence[int],
         activation: str,
         conv_filters: Sequence[tuple[int, int, int]] | None = None,
+        *,
+        normalizes: bool = False,
     ) -> None:
         super().__init__()
         shape = observation_space.shape or ()
         make = _ACTIVATIONS[activation]
         self.conv = None
+        self._image = image_member(observation_space, normalizes=normalizes) if conv_filters else None
         if conv_filters:
+            shape = shape if self._image is None else self._image.shape
             height, width, channels = output_shape(shape, conv_filters)
             convolutions: list[nn.Module] = []
             in_channels = shape[-1]
@@ -67,7 +75,7 @@ class Encoder(nn.Module):
                 convolutions += [make()] if make is not None else []
                 in_channels = out_channels
             self.conv = nn.Sequential(*convolutions)
-            size = height * width * channels
+            size = height * width * channels + (0 if self._image is None else self._image.num_beside)
         elif len(shape) == 1:
             size = shape[0]
         else:
@@ -87,13 +95,26 @@ class Encoder(nn.Module):
     def forward(self, observations: Tensor) -> Tensor:
         """Return the features, shape (B, num_features), of observations of shape (B, ...)."""
         if self.conv is not None:
-            # Environments return (height, width, channels); torch wants the channels first.
-            observations = self.conv(observations.permute(0, 3, 1, 2)).flatten(1)
+            observations = self._convolved(observations)
         # The modules are not called, because torch's overhead of a call costs as much as a small layer.
         features = observations
         for layer in self.mlp:
             features = layer.forward(features)
         return features
+
+    def _convolved(self, observations: Tensor) -> Tensor:
+        """Return what the convolutions make of images, flat, and behind it what is beside them, (B, numbers)."""
+        assert self.conv is not None
+        image = self._image
+        images = observations
+        if image is not None:
+            images = observations[:, image.start : image.stop].reshape(-1, *image.shape)
+            images = images if image.scale == 1.0 else images * image.scale
+        # Environments return (height, width, channels); torch wants the channels first.
+        features: Tensor = self.conv(images.permute(0, 3, 1, 2)).flatten(1)
+        if image is None:
+            return features
+        return torch.cat([features, observations[:, : image.start], observations[:, image.stop :]], dim=1)
 
 
 def hidden_gain(activation: str) -> float:
@@ -205,14 +226,8 @@ class ObservationStatistics:
 
 
 def observation_scale(space: gym.Space[Any]) -> float:
-    """Return the factor that observations are multiplied by first, so that images of bytes are of 0 to 1.
-
-    It is 1 over the largest number that the space has: 1/255 of pixels, 1 of a board's zeros and ones.
-    """
-    seen = seen_by_networks(space)
-    if not isinstance(seen, gym.spaces.Box) or seen.dtype != np.uint8:
-        return 1.0
-    return 1.0 / max(1.0, float(seen.high.max()))
+    """Return the factor that observations are multiplied by first, so that images of bytes are of 0 to 1."""
+    return scale_of_bytes(seen_by_networks(space))
 
 
 def normalization_of(mean: NDArray[Any], variance: NDArray[Any]) -> Normalization:

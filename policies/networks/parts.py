@@ -109,7 +109,13 @@ def make_encoder(observation_space: gym.Space[Any], config: Mapping[str, Any]) -
         SpecError: The convolutions do not fit the observations.
     """
     activation = _OUR_ACTIVATIONS[config["fcnet_activation"]]
-    return Encoder(seen_by_networks(observation_space), config["fcnet_hiddens"], activation, config["conv_filters"])
+    return Encoder(
+        seen_by_networks(observation_space),
+        config["fcnet_hiddens"],
+        activation,
+        config["conv_filters"],
+        normalizes=bool(config.get("normalize_observations")),
+    )
 
 
 def initialize_networks(

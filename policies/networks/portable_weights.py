@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.images import image_member
 from policies.errors import CheckpointError
 from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 from policies.networks.layers import normalization_of, observation_scale
@@ -58,6 +59,7 @@ def network_from_weights(
         conv=conv,
         normalization=normalization_in(weights) if hyperparams.normalize_observations else None,
         scale=observation_scale(observation_space),
+        image=image_member(observation_space, normalizes=hyperparams.normalize_observations) if filters else None,
     )
     _check_sizes(network, hyperparams, weights, encoder)
     return network

@@ -76,7 +76,7 @@ class ActingNetworks:
         self._networks, self._num_acting = networks, num_acting
         self._activations = networks.activations.part(0, num_acting)
         self._num_convolutions = len(networks.convolutions)
-        self._convolutions = StackedConvolutions(networks.convolutions, self._activations)
+        self._convolutions = StackedConvolutions(networks.convolutions, self._activations, networks.image)
         self.refresh()
 
     def refresh(self) -> None:

@@ -10,9 +10,11 @@ save the copies of the windows, but take longer at the sizes of updates (decisio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,10 +22,12 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from torch import Tensor
 
+from policies.envs.images import SeenImage
 from policies.packed.activations import Kept, StackedActivations
 from policies.portable.convolution import Filter, output_shape
 
 Floats = NDArray[np.float32]
+AnyRows = TypeVar("AnyRows", Tensor, Floats)
 
 
 @dataclass(frozen=True)
@@ -111,33 +115,42 @@ class StackedConvolutions:
     Args:
         sizes: The convolutions, from input to output.
         activations: What each network has after each of them.
+        image: The image among the numbers of an observation. What the convolutions make of it comes first among the
+            features, the other numbers behind it. None: all numbers are the image's.
     """
 
-    def __init__(self, sizes: Sequence[Convolution], activations: StackedActivations) -> None:
+    def __init__(
+        self, sizes: Sequence[Convolution], activations: StackedActivations, image: SeenImage | None = None
+    ) -> None:
         self.sizes, self._activations = tuple(sizes), activations
+        is_part = image is not None and (image.num_beside > 0 or image.scale != 1.0)
+        self._image = image if is_part else None
         self._kept: list[tuple[Tensor, Kept]] = []
 
     def forward(self, images: Tensor, layers: Sequence[Tensor]) -> Tensor:
         """Return the features, (K, B, numbers), of images, (K, B, D or more), and keep what `backward` needs."""
         self._kept = []
-        num_images = images.shape[1]
+        num_images, beside = images.shape[1], self._beside(images)
+        images = self._images(images)
         for sizes, layer in zip(self.sizes, layers, strict=True):
             windows = sizes.windows(images)
             out, kept = self._activations.apply(torch.baddbmm(layer[:, -1:], windows, layer[:, :-1]))
             self._kept.append((windows, kept))
             images = out.view(len(out), num_images, -1)
-        return images
+        return torch.cat([images, *beside], dim=2) if beside else images
 
     def evaluate(self, images: Tensor, layers: Sequence[Tensor], activations: StackedActivations) -> Tensor:
         """Return the same features of some of the networks, which have these activations, and keep nothing."""
-        num_images = images.shape[1]
+        num_images, beside = images.shape[1], self._beside(images)
+        images = self._images(images)
         for sizes, layer in zip(self.sizes, layers, strict=True):
             out, _ = activations.apply(torch.baddbmm(layer[:, -1:], sizes.windows(images), layer[:, :-1]))
             images = out.view(len(out), num_images, -1)
-        return images
+        return torch.cat([images, *beside], dim=2) if beside else images
 
     def backward(self, gradient: Tensor, layers: Sequence[Tensor], gradients: Sequence[Tensor]) -> None:
         """Write the gradients of the weights from those of the features of the last `forward`, (K, B, features)."""
+        gradient = gradient[..., : math.prod(self.sizes[-1].out)]
         for number in range(len(self.sizes) - 1, -1, -1):
             sizes, (windows, kept) = self.sizes[number], self._kept[number]
             gradient = gradient.reshape(len(windows), windows.shape[1], sizes.num_filters)
@@ -151,9 +164,24 @@ class StackedConvolutions:
 
     def forward_few(self, images: Floats, layers: Sequence[tuple[Floats, Floats]]) -> Floats:
         """Return the features of a few images, in NumPy; each layer is its matrix and its bias, (K, 1, F)."""
-        num_images = images.shape[1]
+        num_images, beside = images.shape[1], self._beside(images)
+        images = self._images(images)
         for sizes, (matrix, bias) in zip(self.sizes, layers, strict=True):
             out = np.matmul(sizes.windows_of_few(images), matrix)
             out += bias
             images = self._activations.apply_to_few(out).reshape(len(out), num_images, -1)
-        return images
+        return np.concatenate([images, *beside], axis=2) if beside else images
+
+    def _images(self, x: AnyRows) -> AnyRows:
+        """Return the images, (K, B, D or more), among what is observed."""
+        if self._image is None:
+            return x
+        images = x[..., self._image.start : self._image.stop]
+        return images if self._image.scale == 1.0 else images * self._image.scale
+
+    def _beside(self, x: AnyRows) -> list[AnyRows]:
+        """Return what is observed beside the images, in parts; empty: nothing."""
+        image = self._image
+        if image is None or not image.num_beside:
+            return []
+        return [x[..., : image.start], x[..., image.stop : image.num_seen]]

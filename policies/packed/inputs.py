@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from policies.envs.images import SeenImage, image_seen
 from policies.envs.masks import num_masked, seen_by_networks
 from policies.envs.spaces import observation_dtype
 from policies.networks.layers import observation_scale
@@ -33,12 +34,15 @@ class Inputs:
     """What observations are multiplied by first."""
     num_masked: int = 0
     """The numbers of a mask of actions, with which an observation begins."""
+    image: SeenImage | None = None
+    """The image over which convolutions go, if a network has some."""
 
     @classmethod
     def of(cls, space: gym.Space[Any]) -> Self:
         """Return what networks see of observations of a space."""
         shape = tuple(seen_by_networks(space).shape or ())
-        return cls(shape, observation_dtype(space), observation_scale(space), num_masked(space))
+        scale = observation_scale(space)
+        return cls(shape, observation_dtype(space), scale, num_masked(space), image_seen(space))
 
     @classmethod
     def vector(cls, num_inputs: int, num_masked: int = 0) -> Self:
@@ -62,7 +66,7 @@ class Inputs:
 
     @property
     def is_image(self) -> bool:
-        """Whether there are convolutions."""
+        """Whether observations are images as a whole."""
         return len(self.shape) > 1
 
     @cached_property

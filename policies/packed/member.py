@@ -92,11 +92,17 @@ class Part:
     weights, while a stack has channels last. None: inputs are vectors."""
     is_kernel: bool = False
     """Whether it is a convolution."""
+    num_beside: int = 0
+    """The inputs of a dense layer behind those that are of images."""
 
     def as_matrix(self, weight: NDArray[Any]) -> NDArray[Any]:
         """Return the RLModule's weight as the stack's matrix, (inputs, outputs)."""
         if self.planes is not None:
-            weight = weight.reshape(-1, *self.planes).transpose(0, 2, 3, 1).reshape(len(weight), -1)
+            num_outputs = len(weight)
+            weight = weight.reshape(num_outputs, -1)
+            size = math.prod(self.planes)
+            of_images = weight[:, :size].reshape(-1, *self.planes).transpose(0, 2, 3, 1)
+            weight = np.concatenate([of_images.reshape(num_outputs, -1), weight[:, size:]], axis=1)
         return np.ascontiguousarray(weight.T)
 
     def as_weight(self, matrix: NDArray[Any]) -> NDArray[Any]:
@@ -104,8 +110,11 @@ class Part:
         weight = matrix.T
         if self.planes is not None:
             channels, height, width = self.planes
-            weight = weight.reshape(-1, height, width, channels).transpose(0, 3, 1, 2)
-            weight = weight if self.is_kernel else weight.reshape(len(weight), -1)
+            of_images = weight[:, : math.prod(self.planes)].reshape(-1, height, width, channels).transpose(0, 3, 1, 2)
+            if self.is_kernel:
+                return np.array(of_images, order="C")
+            beside = weight[:, math.prod(self.planes) :]
+            weight = np.concatenate([of_images.reshape(len(weight), -1), beside], axis=1)
         return np.array(weight, order="C")
 
 
@@ -129,7 +138,7 @@ class NetworkLayout:
         for parts, layer in zip(self.layers, layers, strict=True):
             for part in parts:
                 columns = layer[:, part.start : part.stop].detach().cpu().numpy()
-                num_inputs = num_inputs if part.planes is None else math.prod(part.planes)
+                num_inputs = num_inputs if part.planes is None else math.prod(part.planes) + part.num_beside
                 weights[f"{prefix}{part.name}.weight"] = part.as_weight(columns[:num_inputs])
                 weights[f"{prefix}{part.name}.bias"] = np.array(columns[-1])
             num_inputs = parts[-1].stop
@@ -137,7 +146,10 @@ class NetworkLayout:
 
 
 def network_layouts(
-    hyperparams: TrainedHyperparams, num_outputs: int, convolutions: Sequence[Convolution] = ()
+    hyperparams: TrainedHyperparams,
+    num_outputs: int,
+    convolutions: Sequence[Convolution] = (),
+    num_beside: int = 0,
 ) -> tuple[NetworkLayout, ...]:
     """Return the layouts of one member's networks.
 
@@ -145,26 +157,31 @@ def network_layouts(
         hyperparams: The member's.
         num_outputs: PPO: the number of outputs of the policy's head; DQN: the number of actions.
         convolutions: The sizes of its convolutions.
+        num_beside: The numbers of an observation that dense layers get beside what convolutions make of the others.
 
     Returns:
         PPO: the policy and the value function, or both in one if they share layers; DQN: the Q-network. The value is
         the last output, or the first in a network for the value function only.
     """
     value = Part("vf", num_outputs, num_outputs + 1)
+
+    def layout(encoder: str, heads: list[Part]) -> NetworkLayout:
+        return _layout(hyperparams, encoder, heads, convolutions, num_beside)
+
     if isinstance(hyperparams, DQNHyperparams):
-        heads = [Part("af", 0, num_outputs), *([value] if hyperparams.dueling else [])]
-        return (_layout(hyperparams, "encoder", heads, convolutions),)
+        return (layout("encoder", [Part("af", 0, num_outputs), *([value] if hyperparams.dueling else [])]),)
     policy = Part("pi", 0, num_outputs)
     if hyperparams.vf_share_layers:
-        return (_layout(hyperparams, "encoder.encoder", [policy, value], convolutions),)
-    return (
-        _layout(hyperparams, "encoder.actor_encoder", [policy], convolutions),
-        _layout(hyperparams, "encoder.critic_encoder", [Part("vf", 0, 1)], convolutions),
-    )
+        return (layout("encoder.encoder", [policy, value]),)
+    return (layout("encoder.actor_encoder", [policy]), layout("encoder.critic_encoder", [Part("vf", 0, 1)]))
 
 
 def _layout(
-    hyperparams: TrainedHyperparams, encoder: str, heads: list[Part], convolutions: Sequence[Convolution]
+    hyperparams: TrainedHyperparams,
+    encoder: str,
+    heads: list[Part],
+    convolutions: Sequence[Convolution],
+    num_beside: int,
 ) -> NetworkLayout:
     # Layers with weights are at every other index, with the activations (none if linear) between them.
     step = 1 if hyperparams.activation == "linear" else 2
@@ -174,10 +191,11 @@ def _layout(
         kernels.append((Part(f"{encoder}.conv.{number * step}", 0, one.num_filters, kernel, is_kernel=True),))
         height, width, channels = one.out
         planes = channels, height, width
-    hidden = [
-        (Part(f"{encoder}.mlp.{number * step}", 0, size, None if number else planes),)
-        for number, size in enumerate(hyperparams.hidden_sizes)
-    ]
+    hidden = []
+    for number, size in enumerate(hyperparams.hidden_sizes):
+        name = f"{encoder}.mlp.{number * step}"
+        first = Part(name, 0, size, planes, num_beside=num_beside)
+        hidden.append((Part(name, 0, size) if number else first,))
     return NetworkLayout((*kernels, *hidden, tuple(heads)))
 
 

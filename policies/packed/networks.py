@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from policies.envs.images import SeenImage
 from policies.packed.activations import Kept, StackedActivations
 from policies.packed.convolutions import Convolution, StackedConvolutions
 from policies.packed.sizes import LINE, NARROW
@@ -42,7 +43,8 @@ class StackedNetworks:
             are neighbours.
         device: Where the weights lie.
         convolutions: The convolutions before the dense layers, whose last output has as many numbers as `sizes` begins
-            with.
+            with, and all other inputs behind them.
+        image: The image among the inputs that the convolutions go over; None: all inputs are the image's.
 
     Attributes:
         weights: All weights, shape (K, P); a layer's block is its matrix, then its bias as one more row. It begins at a
@@ -59,9 +61,11 @@ class StackedNetworks:
         activations: Sequence[str],
         device: str = "cpu",
         convolutions: Sequence[Convolution] = (),
+        *,
+        image: SeenImage | None = None,
     ) -> None:
         self.num_networks, self.sizes = num_networks, tuple(sizes)
-        self.convolutions = tuple(convolutions)
+        self.convolutions, self.image = tuple(convolutions), image
         self._shapes = [
             *((one.window + 1, one.num_filters) for one in convolutions),
             *((inputs + 1, outputs) for inputs, outputs in itertools.pairwise(sizes)),
@@ -72,7 +76,7 @@ class StackedNetworks:
         self.layers = self._views(self.weights)
         self.gradient_layers = self._views(self.gradients)
         self.activations = StackedActivations(activations)
-        self._stacked = StackedConvolutions(convolutions, self.activations)
+        self._stacked = StackedConvolutions(convolutions, self.activations, image)
         num = len(self.convolutions)
         self._dense = [_Dense(layer) for layer in self.layers[num:]]
         self._dense_gradients = [

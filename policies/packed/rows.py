@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from policies.envs.images import SeenImage
 from policies.packed.convolutions import convolutions_for
 from policies.packed.member import AnyMember, NetworkLayout, network_layouts, num_stack_outputs
 from policies.packed.networks import StackedNetworks
@@ -26,22 +28,37 @@ class StackedRows:
         num_outputs: The number of outputs of a policy's head, or of actions.
         device: Where the weights lie.
         prefix: The prefix of the weights' names: that of the target networks, or none.
+        image: The image among the numbers of an observation, for convolutions; None: it is one as a whole, or has none.
     """
 
     def __init__(
-        self, members: Sequence[AnyMember], shape: Sequence[int], num_outputs: int, device: str, prefix: str = ""
+        self,
+        members: Sequence[AnyMember],
+        shape: Sequence[int],
+        num_outputs: int,
+        device: str,
+        prefix: str = "",
+        *,
+        image: SeenImage | None = None,
     ) -> None:
         first = members[0].hyperparams
         self._members, self._num_inputs, self._prefix = members, math.prod(shape), prefix
-        convolutions = convolutions_for(shape, first.conv_filters)
-        self._layouts = [network_layouts(member.hyperparams, num_outputs, convolutions) for member in members]
+        if not first.conv_filters:
+            image = None
+        elif image is not None and first.normalize_observations:
+            image = replace(image, scale=1.0)
+        num_beside = 0 if image is None else image.num_beside
+        convolutions = convolutions_for(shape if image is None else image.shape, first.conv_filters)
+        self._layouts = [
+            network_layouts(member.hyperparams, num_outputs, convolutions, num_beside) for member in members
+        ]
         self.networks_per_member = len(self._layouts[0])
         hidden = [max(sizes) for sizes in zip(*(member.hyperparams.hidden_sizes for member in members), strict=True)]
-        num_inputs = math.prod(convolutions[-1].out if convolutions else shape)
+        num_inputs = math.prod(convolutions[-1].out) + num_beside if convolutions else math.prod(shape)
         sizes = (num_inputs, *hidden, num_stack_outputs(first, num_outputs))
         num_networks = self.networks_per_member * len(members)
         activations = [member.hyperparams.activation for member in members] * self.networks_per_member
-        self.networks = StackedNetworks(num_networks, sizes, activations, device, convolutions)
+        self.networks = StackedNetworks(num_networks, sizes, activations, device, convolutions, image=image)
         for _, layers, member, layout in self._rows(self.networks.layers):
             layout.write(layers, member.weights, prefix)
 

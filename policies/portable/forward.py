@@ -30,6 +30,7 @@ class ForwardPass:
         self._scale = None if network.scale == 1.0 else np.float32(network.scale)
         self._normalize = None if network.normalization is None else _Normalize(network.normalization)
         self._conv = [_Conv(layer) for layer in network.conv]
+        self._image = network.image
         self.layers = [_Linear(layer) for layer in network.layers]
 
     @property
@@ -51,9 +52,7 @@ class ForwardPass:
             return np.concatenate([self(observations[first : first + _IMAGES_AT_ONCE]) for first in parts])
         x = self.prepare(observations)
         if self._conv:
-            for conv in self._conv:
-                x = conv(x)
-            x = x.transpose(0, 3, 1, 2)  # channels first, as torch flattens images
+            x = self._convolved(x)
         # One vector-matrix product per observation (a stack of 1-row matrices): a single product of the batch
         # takes other BLAS kernels at other batch sizes, whose results differ in the last bit. It costs no
         # more at these sizes.
@@ -61,6 +60,21 @@ class ForwardPass:
         for layer in self.layers:
             x = layer(x)
         return x[:, 0, :]
+
+    def _convolved(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what the convolutions make of images, and behind it, if these are part of vectors, what is beside."""
+        image = self._image
+        images = x if image is None else np.ascontiguousarray(x[:, image.start : image.stop])
+        if image is not None:
+            images = images.reshape(-1, *image.shape)
+            images = images if image.scale == 1.0 else images * np.float32(image.scale)
+        for conv in self._conv:
+            images = conv(images)
+        images = images.transpose(0, 3, 1, 2)  # channels first, as torch flattens images
+        if image is None:
+            return images
+        flat = images.reshape(len(images), -1)
+        return np.concatenate([flat, x[:, : image.start], x[:, image.stop :]], axis=1)
 
 
 class ForwardPasses:

@@ -15,6 +15,7 @@ means:
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.activations import ACTIVATIONS
+from policies.envs.images import SeenImage
 from policies.envs.masks import MaskedBox, seen_by_networks
 from policies.envs.own_actions import Choices, sizes_of
 from policies.errors import SpecError
@@ -96,7 +98,10 @@ class PolicyNetwork:
     action: int | tuple[float, ...] | None = None
     """The action, only of kind `constant`; for Box actions, one number for each component."""
     conv: tuple[ConvLayer, ...] = ()
-    """The convolutions before the layers, for observations of shape (height, width, channels)."""
+    """The convolutions before the layers, for images of shape (height, width, channels)."""
+    image: SeenImage | None = None
+    """The image among the numbers of a vector that the convolutions see; the layers get what they make of it, and then
+    the other numbers. None: observations are images as a whole, or there are no convolutions."""
     normalization: Normalization | None = None
     scale: float = 1.0
     """The factor that observations are multiplied by first."""
@@ -143,6 +148,8 @@ def network_to_json(network: PolicyNetwork) -> tuple[dict[str, Any], Tensors]:
         for index, conv in enumerate(network.conv):
             tensors[f"conv.{index}.weight"] = np.ascontiguousarray(conv.weight, dtype=np.float32)
             tensors[f"conv.{index}.bias"] = np.ascontiguousarray(conv.bias, dtype=np.float32)
+    if network.image is not None:
+        description["image"] = {**dataclasses.asdict(network.image), "shape": list(network.image.shape)}
     if network.module is not None:
         description["module"] = {"class": network.module.class_path, "model_config": network.module.model_config}
         for name, tensor in network.module.tensors.items():
@@ -188,10 +195,19 @@ def network_from_json(description: Mapping[str, Any], tensors: Tensors) -> Polic
         layers=layers,
         action=_action_from_json(description.get("action")),
         conv=conv,
+        image=_image_from_json(description.get("image")),
         normalization=normalization,
         scale=float(description.get("scale", 1.0)),
         module=module,
     )
+
+
+def _image_from_json(value: Mapping[str, Any] | None) -> SeenImage | None:
+    if value is None:
+        return None
+    height, width, channels = (int(size) for size in value["shape"])
+    start, num_beside = int(value["start"]), int(value["num_beside"])
+    return SeenImage((height, width, channels), start, num_beside, float(value["scale"]))
 
 
 def _action_from_json(value: Any) -> int | tuple[float, ...] | None:
@@ -226,7 +242,12 @@ def _chain_problem(network: PolicyNetwork, shape: tuple[int, ...], action_space:
     if isinstance(action_space, gym.spaces.Box) is not (network.kind == "gaussian"):
         what = "box" if isinstance(action_space, gym.spaces.Box) else "discrete"
         return f"a network of kind {network.kind!r} gives no actions of type {what!r}"
+    num_beside = 0
     if network.conv:
+        if problem := _image_problem(network.image, shape):
+            return problem
+        if network.image is not None:
+            shape, num_beside = network.image.shape, network.image.num_beside
         if problem := _conv_problem(network.conv, shape):
             return problem
         shape = output_shape(shape, conv_filters(network.conv))
@@ -234,7 +255,7 @@ def _chain_problem(network: PolicyNetwork, shape: tuple[int, ...], action_space:
     if network.kind == "q_values" and len(sizes) != 1:
         return f"a network of kind 'q_values' gives no actions of {len(sizes)} choices"
     num_actions = 2 * math.prod(action_space.shape) if isinstance(action_space, gym.spaces.Box) else sum(sizes)
-    return _layers_problem(network.layers, math.prod(shape), num_actions)
+    return _layers_problem(network.layers, math.prod(shape) + num_beside, num_actions)
 
 
 def conv_filters(conv: tuple[ConvLayer, ...]) -> list[tuple[int, int, int]]:
@@ -250,6 +271,13 @@ def _normalization_problem(normalization: Normalization | None, shape: tuple[int
         if found != shape:
             return f"the normalization has a {name} of shape {found}, but observations are of shape {shape}"
     return "" if normalization.clip > 0 else f"the normalization clips at {normalization.clip}"
+
+
+def _image_problem(image: SeenImage | None, shape: tuple[int, ...]) -> str:
+    """Return why an image is not among the numbers of vectors of a shape."""
+    if image is None or (shape == (image.num_seen,) and image.start >= 0 and image.stop <= image.num_seen):
+        return ""
+    return f"an image of shape {image.shape} from number {image.start} on is not in observations of shape {shape}"
 
 
 def _conv_problem(conv: tuple[ConvLayer, ...], shape: tuple[int, ...]) -> str:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 BYTES, NUMBERS, MASKED, BITS = "TestShades-v0", "TestFineShades-v0", "TestMaskedShades-v0", "TestBits-v0"
+# An image of the same size among other members.
+BESIDE, FINE_BESIDE, MASKED_BESIDE = "TestBeside-v0", "TestFineBeside-v0", "TestMaskedBeside-v0"
 FILTERS = ((5, 4, 2), (3, 2, 1))
 """12 x 9 x 2 -> 5 x 3 x 5 -> 4 x 2 x 3."""
 # As in `packed_rllib` and `packed_dqn`, but the gradient of a kernel is a sum over its 15 places in each row, too.
@@ -61,6 +63,17 @@ PPO: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
     ]),
     "zeros and ones": (BITS, {"conv_filters": FILTERS}, [{}, {"hidden_sizes": (5,)}]),
     "masked bytes, normalised": (MASKED, {"conv_filters": FILTERS, "normalize_observations": True}, [{}]),
+    "bytes beside others, KL": (BESIDE, {"conv_filters": FILTERS, "use_kl_loss": True}, [
+        {"kl_coeff": 0.7}, {"hidden_sizes": (5,), "grad_clip": 0.3}, {"hidden_sizes": (6,), "lr": 1e-3},
+    ]),
+    "bytes beside others, normalised, shared layers": (
+        BESIDE, {"conv_filters": FILTERS, "normalize_observations": True, "vf_share_layers": True}, [{}, {"lr": 1e-3}],
+    ),
+    "numbers beside others, linear, two layers": (
+        FINE_BESIDE, {"conv_filters": ((4, 3, 3),), "activation": "linear"},
+        [{"hidden_sizes": (8, 6)}, {"hidden_sizes": (7, 5), "entropy_coeff": 0.1}],
+    ),
+    "bytes beside others and a mask": (MASKED_BESIDE, {"conv_filters": FILTERS}, [{}, {"hidden_sizes": (5,)}]),
 }  # fmt: skip
 DQN: dict[str, tuple[str, list[dict[str, Any]]]] = {
     "bytes, double, dueling": (BYTES, [
@@ -82,6 +95,13 @@ DQN: dict[str, tuple[str, list[dict[str, Any]]]] = {
     "masked bytes, normalised, n-step": (MASKED, [
         {"conv_filters": ((4, 3, 2),), "normalize_observations": True, "n_step": 3, "tau": 0.2, "double_q": False},
     ]),
+    "bytes beside others, double, dueling": (BESIDE, [
+        {"conv_filters": FILTERS, "target_update_freq": 10}, {"conv_filters": FILTERS, "hidden_sizes": (5,)},
+    ]),
+    "numbers beside others, normalised": (FINE_BESIDE, [
+        {"conv_filters": ((4, 3, 2),), "normalize_observations": True, "tau": 0.2, "dueling": False},
+    ]),
+    "bytes beside others and a mask": (MASKED_BESIDE, [{"conv_filters": FILTERS, "n_step": 2}]),
 }  # fmt: skip
 
 
@@ -140,6 +160,8 @@ def stack_of(env_id: str, algorithm: str, num_members: int, env_args: dict[str, 
     (BYTES, "dqn", {"n_step": 2}),
     (MASKED, "ppo", {"minibatch_size": 20}),
     (MASKED, "dqn", {"normalize_observations": True}),
+    (BESIDE, "ppo", {"minibatch_size": 20}),
+    (MASKED_BESIDE, "dqn", {}),
     (NUMBERS, "dqn", {"normalize_observations": True, "activation": "gelu"}),
 ])  # fmt: skip
 def test_a_member_does_not_depend_on_the_others_to_the_bit(env_id: str, algorithm: str, values: dict[str, Any]) -> None:
@@ -204,13 +226,32 @@ def task_of(folder: Path, algorithm: str, seed: int, env_id: str = BYTES) -> Tri
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("env_id", [BYTES, MASKED, BITS])
+@pytest.mark.parametrize("env_id", [BYTES, MASKED, BITS, BESIDE, MASKED_BESIDE])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_a_pack_learns_to_look(algorithm: str, env_id: str, tmp_path: Path) -> None:
     tasks = [task_of(tmp_path, algorithm, seed, env_id) for seed in range(2)]
     for policy in train_pack(tasks, tmp_path, NUM_ITERATIONS):
         with Evaluator(env_id, {}, SEEDS) as evaluator:
             assert evaluator.run(policy).mean_return >= LEARNED
+
+
+@pytest.mark.parametrize("env_id", [BESIDE, MASKED_BESIDE])
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_a_trial_of_rllibs_learns_to_look_at_an_image_among_others(algorithm: str, env_id: str, tmp_path: Path) -> None:
+    from tune_jobs.training.rllib import RLlibEngine
+
+    engine = RLlibEngine()
+    progress = run_trial(task_of(tmp_path, algorithm, 0, env_id), engine)
+    engine.close()
+    assert progress.status == "completed", progress
+    policy = load_policy(tmp_path / progress.checkpoints[-1].path)
+    env, total = gym.make(env_id), 0.0
+    for seed in SEEDS:
+        observation, _ = env.reset(seed=seed)
+        for _ in range(NUM_STEPS):
+            observation, reward, *_ = env.step(policy.act(observation))
+            total += float(reward)
+    assert total / len(SEEDS) >= LEARNED
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
@@ -259,13 +300,13 @@ def test_a_checkpoint_of_images_that_were_scaled_otherwise_does_not_go_on(tmp_pa
         algorithm_from_checkpoint(folder)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_a_checkpoint_goes_on_and_is_an_rllib_algorithm(algorithm: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("algorithm", "env_id"), [("ppo", BYTES), ("dqn", BYTES), ("ppo", BESIDE), ("dqn", BESIDE)])
+def test_a_checkpoint_goes_on_and_is_an_rllib_algorithm(algorithm: str, env_id: str, tmp_path: Path) -> None:
     from policies.packed.to_rllib import algorithm_from_checkpoint
     from tune_jobs.training.packed import PackedEngine
 
     engine, folder = PackedEngine(), tmp_path / "000001"
-    engine.add(task := task_of(tmp_path, algorithm, 0), None)
+    engine.add(task := task_of(tmp_path, algorithm, 0, env_id), None)
     engine.train_iteration()
     save_policy(engine.policy(task.trial_id), folder)
     engine.save(task.trial_id, folder)
@@ -277,7 +318,11 @@ def test_a_checkpoint_goes_on_and_is_an_rllib_algorithm(algorithm: str, tmp_path
     assert_same(weights, member.weights)
     for name, found in member.moments.items():
         assert_same(moments[name], found)
-    images = np.random.default_rng(0).integers(0, 256, (100, 12, 9, 2), dtype=np.uint8)
+    rng = np.random.default_rng(0)
+    images: Any = rng.integers(0, 256, (100, 12, 9, 2), dtype=np.uint8)
+    if env_id == BESIDE:
+        parts = [rng.normal(size=(100, 3)), images.reshape(100, -1), np.eye(2)[rng.integers(0, 2, 100)]]
+        images = np.concatenate(parts, axis=1).astype(np.float32)
     with torch.no_grad():
         module = rllib.get_module(packed_rllib.MODULE)
         outputs = module.forward_inference({"obs": torch.from_numpy(images)})

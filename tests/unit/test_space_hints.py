@@ -185,7 +185,7 @@ HEALTH = spaces.Box(0, 1, (2,), np.float32)
     ("observations", "place", "size"),
     [
         (spaces.Dict({"health": HEALTH, "map": SMALL, "screen": SCREEN}), "observation['screen']", "3,600"),
-        (spaces.Tuple((HEALTH, spaces.Dict({"eye": SCREEN}))), "observation[1]['eye']", "3,600"),
+        (spaces.Tuple((SMALL, spaces.Dict({"eye": SCREEN}))), "observation[1]['eye']", "3,600"),
     ],
 )
 def test_the_wrapper_that_a_plan_names_observes_the_image_alone(
@@ -213,6 +213,7 @@ def test_the_wrapper_that_a_plan_names_observes_the_image_alone(
     "observations",
     [
         spaces.Dict({"health": HEALTH, "map": SMALL}),
+        spaces.Dict({"first": SMALL, "second": SMALL}),
         spaces.Dict({"grid": spaces.Box(-1, 1, (40, 30, 3), np.float32)}),
         spaces.Dict({"letters": spaces.Box(0, 255, (80, 80), np.uint8)}),
         spaces.Dict({"texts": spaces.Box(0, 255, (21, 79, 80), np.uint8)}),

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from policies.envs.masks import seen_by_networks
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
     DQNHyperparams,
@@ -211,19 +210,19 @@ class _Images:
 
     def why_not(self, engine: Engine, hyperparams: Hyperparams | None) -> str | None:
         """Return why an engine is not chosen for a trial, or None if it is; None for a point that is not known."""
-        if self._spec.engine == engine.name or "large_images" not in engine.lacks or not self._env.observes_images:
+        image = self._env.image
+        if self._spec.engine == engine.name or "large_images" not in engine.lacks or image is None:
             return None
         if self._spec.resources.num_gpus:  # decision 54
             return None
         if hyperparams is None and not self._largest and self._known:
             self._largest = largest_hyperparams(self._spec, self._known)
-        shape = tuple(seen_by_networks(self._env.observation_space).shape or ())
         most = max(
-            (products_per_image(shape, each) for each in ([hyperparams] if hyperparams else self._largest)), default=0
+            (products_per_image(image, each) for each in ([hyperparams] if hyperparams else self._largest)), default=0
         )
         if most <= MAX_PRODUCTS:
             return None
-        size = " x ".join(map(str, shape))
+        size = " x ".join(map(str, image.shape))
         return engine.why_not("large_images", f"a network makes {most:,} multiplications for an image of {size}")
 
 

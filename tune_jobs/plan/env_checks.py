@@ -11,12 +11,13 @@ import numpy as np
 
 from policies.acting.baselines import BASELINES
 from policies.envs.failures import check_failure_penalty
-from policies.envs.flat import FlatBox, leaves, named
+from policies.envs.flat import named
+from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices
-from policies.envs.space_hints import channels_last_hint, image_alone_hint
+from policies.envs.space_hints import channels_last_hint, one_image_hint
 from policies.envs.wrappers import PIXELS, RESERVED
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
@@ -28,8 +29,6 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 _EXAMPLES = ((20, "[[16, 8, 4], [32, 4, 2]]"), (3, "[[16, 3, 1]]"), (1, "[[16, 1, 1]]"))
 # Those of Mnih et al. 2015.
 _EXAMPLES_FOR_ATARI = ((36, "[[32, 8, 4], [64, 4, 2], [64, 3, 1]]"), *_EXAMPLES)
-_IMAGE = 3
-"""The dimensions of an image."""
 _FEW_CHANNELS = (1, 3, 4)
 """Of grey images, of coloured ones, and of those with transparency or of four frames."""
 
@@ -136,37 +135,45 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
                     _with_channels(
                         spec,
                         env,
-                        f"Set {place} to [channels, kernel, stride] of each layer, such as {_example(spec, env)}.",
+                        f"Set {place} to [channels, kernel, stride] of each layer, such as "
+                        f"{filters_example(spec, env)}.",
                     ),
                 )
             continue
-        if not env.observes_images:
+        if env.image is None:
             raise SpecError(
                 f"{place} is {[list(one) for one in filters]}, but the observations of {env.env_id} are flat, of shape "
-                f"{shape}: convolutions are for images.",
-                _without_images(env, place),
+                f"{shape}{_several_images(env)}: convolutions are for images.",
+                _without_images(spec, env, place),
             )
         try:
-            output_shape(shape, filters)
+            output_shape(env.image.shape, filters)
         except SpecError as error:
             hint = _with_channels(spec, env, error.hint)
             raise SpecError(f"{place} does not fit {env.env_id}: {error.message}", hint) from error
 
 
-def _without_images(env: EnvInfo, place: str) -> str:
-    """Return what to do about convolutions where vectors are observed: it may be that members of them are images."""
-    seen = seen_by_networks(env.observation_space)
-    members = leaves(seen.original, ()) if isinstance(seen, FlatBox) else ()
-    image = next((keys for keys, leaf in members if keys and len(leaf.shape or ()) == _IMAGE), None)
-    if image is None:
-        return f"Leave {place} out, or observe images with env.{PIXELS}: true."
-    mask = "" if env.mask is None else " (with the mask as a method of its own, action_masks)"
-    return f"Leave {place} out, or observe {named(image)} alone{mask}. {image_alone_hint(env.env_id, image)}"
+def _several_images(env: EnvInfo) -> str:
+    images = image_members(env.observation_space)
+    return f", with {len(images)} images among their members" if images else ""
 
 
-def _example(spec: SweepSpec, env: EnvInfo) -> str:
-    """Return `conv_filters` that fit the images of an environment, if their channels come last."""
-    shape = seen_by_networks(env.observation_space).shape or ()
+def _without_images(spec: SweepSpec, env: EnvInfo, place: str) -> str:
+    """Return what to do about convolutions where vectors are observed: several members of them may be images."""
+    images = list(image_members(env.observation_space))
+    if images:
+        names = " and ".join(named(keys) for keys in images)
+        own = getattr(env.observation_space, "original", env.observation_space)
+        return f"Leave {place} out, or observe only one of {names}. {one_image_hint(env.env_id, own, images)}"
+    if spec.env.frame_stack > 1:
+        return f"Leave {place} out, or env.frame_stack: it makes one vector of all members, images among them."
+    return f"Leave {place} out, or observe images with env.{PIXELS}: true."
+
+
+def filters_example(spec: SweepSpec, env: EnvInfo) -> str:
+    """Return `conv_filters` that fit the images that an environment has, if their channels come last."""
+    assert env.image is not None
+    shape = env.image.shape
     smallest = min(shape[1:] if _has_channels_first(shape) else shape[:2])
     examples = _EXAMPLES if spec.env.atari is None else _EXAMPLES_FOR_ATARI
     return next(example for fewest, example in examples if smallest >= fewest)

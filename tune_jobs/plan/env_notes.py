@@ -11,15 +11,17 @@ import numpy as np
 from gymnasium.spaces.utils import flatdim
 
 from analysis.wording import counted, duration
+from policies.acting.baselines import BASELINES
 from policies.acting.evaluate import MAX_EPISODE_STEPS
 from policies.envs.flat import FlatBox, leaves, named
+from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices, is_made
 from policies.envs.space_hints import image_alone_hint
 from policies.errors import shortened
 from tune_jobs.plan.engine_choice import PackPlan
-from tune_jobs.plan.env_checks import channels_hint
+from tune_jobs.plan.env_checks import channels_hint, filters_example
 from tune_jobs.plan.size_notes import size_notes
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -44,8 +46,7 @@ def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
     if isinstance(seen, FlatBox):
         kind = "images of shape" if env.observes_images else "vectors of shape"
         yield f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}."
-        # Who observes the image alone would lose a mask that is a member beside it.
-        if spec.rl_module is None and env.mask is None and (note := _note_on_image(env, seen.original)):
+        if spec.rl_module is None and spec.algorithm not in BASELINES and (note := _note_on_image(spec, env, seen)):
             yield note
         if note := _note_on_choices(seen):
             yield note
@@ -95,16 +96,32 @@ def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterat
         )
 
 
-def _note_on_image(env: EnvInfo, space: gym.Space[Any]) -> str | None:
-    """Return a note on the largest image among members that are made one vector; None: none is large."""
-    sizes = {keys: math.prod(leaf.shape) for keys, leaf in leaves(space, ()) if keys and _is_image(leaf)}
+def _note_on_image(spec: SweepSpec, env: EnvInfo, vectors: FlatBox) -> str | None:
+    """Return a note on the largest image among members that are made one vector; None: none is large, or seen."""
+    images = image_members(env.observation_space)
+    if images and env.image is not None and _has_convolutions(spec):
+        ((keys, shape),) = images.items()
+        num_beside = env.image.num_beside
+        beside = f"; the other {num_beside:,} numbers go into the dense layers" if num_beside else ""
+        return f"Convolutions see {named(keys)}, of {shape} (rows, columns, channels){beside}."
+    sizes = {keys: math.prod(leaf.shape) for keys, leaf in leaves(vectors.original, ()) if keys and _is_image(leaf)}
     keys = max(sizes, key=lambda each: sizes[each], default=())
     if not keys or sizes[keys] < _FEW_NUMBERS:
         return None
+    if list(images) == [keys]:
+        hint = f"hyperparams.conv_filters, such as {filters_example(spec, env)}, has convolutions see it."
+    elif env.mask is None:
+        hint = image_alone_hint(env.env_id, keys)
+    else:
+        return None  # who observes the image alone would lose a mask that is a member beside it
     return (
         f"{sizes[keys]:,} numbers of these vectors are those of an image, {named(keys)}: networks see no pixel beside "
-        f"another, and have a weight for every number and unit. {image_alone_hint(env.env_id, keys)}"
+        f"another, and have a weight for every number and unit. {hint}"
     )
+
+
+def _has_convolutions(spec: SweepSpec) -> bool:
+    return bool(spec.hyperparams.get("conv_filters")) or "conv_filters" in spec.space
 
 
 def _note_on_choices(vectors: FlatBox) -> str | None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from policies.envs.images import SeenImage
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import sizes_of
 from policies.envs.spaces import observation_dtype
@@ -94,24 +94,24 @@ def trial_bytes(env: EnvInfo, values: Hyperparams) -> int:
     return total
 
 
-def products_per_image(shape: Sequence[int], values: Hyperparams) -> int:
-    """Return the multiplications of a network, but for its head's, for an image of (height, width, channels)."""
+def products_per_image(image: SeenImage, values: Hyperparams) -> int:
+    """Return the multiplications of a network, but for its head's, for an observation with an image."""
     if isinstance(values, RandomHyperparams) or values.conv_filters is None:
         return 0
     products = 0
     for number, (channels, kernel, _) in enumerate(values.conv_filters):
-        inputs = output_shape(shape, values.conv_filters[:number])[2]
-        height, width, _ = output_shape(shape, values.conv_filters[: number + 1])
+        inputs = output_shape(image.shape, values.conv_filters[:number])[2]
+        height, width, _ = output_shape(image.shape, values.conv_filters[: number + 1])
         products += height * width * kernel**2 * inputs * channels
-    sizes = [math.prod(output_shape(shape, values.conv_filters)), *values.hidden_sizes]
+    sizes = [math.prod(output_shape(image.shape, values.conv_filters)) + image.num_beside, *values.hidden_sizes]
     return products + sum(inputs * outputs for inputs, outputs in itertools.pairwise(sizes))
 
 
 def _numbers_of_convolutions(env: EnvInfo, values: Hyperparams) -> int:
     """Return the numbers that the convolutions of one network keep of an image: the windows of kernels, and outputs."""
-    if isinstance(values, RandomHyperparams) or values.conv_filters is None:
+    if isinstance(values, RandomHyperparams) or values.conv_filters is None or env.image is None:
         return 0
-    shape, numbers = tuple(seen_by_networks(env.observation_space).shape or ()), 0
+    shape, numbers = env.image.shape, 0
     for number, (channels, kernel, _) in enumerate(values.conv_filters):
         inputs = output_shape(shape, values.conv_filters[:number])[2]
         height, width, _ = output_shape(shape, values.conv_filters[: number + 1])
@@ -124,14 +124,15 @@ def _num_weights(env: EnvInfo, values: Hyperparams) -> int:
         return 0
     space: Any = env.action_space
     num_outputs = 2 * (sum(sizes_of(space)) or math.prod(space.shape or ()))
-    shape = tuple(seen_by_networks(env.observation_space).shape or ())
+    shape, num_beside = tuple(seen_by_networks(env.observation_space).shape or ()), 0
     weights = 0
-    if values.conv_filters is not None:
+    if values.conv_filters is not None and env.image is not None:
+        shape, num_beside = env.image.shape, env.image.num_beside
         channels = [shape[-1], *(item[0] for item in values.conv_filters)]
         for (inputs, outputs), (_, kernel, _) in zip(itertools.pairwise(channels), values.conv_filters, strict=True):
             weights += (inputs * kernel**2 + 1) * outputs
         shape = output_shape(shape, values.conv_filters)
-    sizes = [math.prod(shape), *values.hidden_sizes, num_outputs + 1]
+    sizes = [math.prod(shape) + num_beside, *values.hidden_sizes, num_outputs + 1]
     weights += sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     networks = 1 if isinstance(values, DQNHyperparams) else 2  # PPO: policy and value function
     return networks * weights

@@ -12,6 +12,8 @@ import numpy as np
 
 from policies.acting.baselines import BASELINES
 from policies.envs.first_step import Largest
+from policies.envs.flat import named
+from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.space_hints import smaller_rewards_hint
@@ -39,10 +41,24 @@ def size_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None) -> Iterato
         assert isinstance(seen, gym.spaces.Box)
         if env.observes_images and seen.dtype == np.uint8:
             yield from _on_bytes(env.env_id, abs(env.largest.value), int(seen.high.max()))
+        elif (highest := _highest_of_convolved(spec, env, env.largest)) is not None:
+            yield from _on_bytes(env.env_id, abs(env.largest.value), highest)
         else:
             yield from _on_numbers(env.env_id, env.largest, None if packs is None else packs.largest)
     if spec.algorithm == "dqn" and packs is not None and packs.reward is not None:
         yield from _on_rewards(env.env_id, packs.reward)
+
+
+def _highest_of_convolved(spec: SweepSpec, env: EnvInfo, largest: Largest) -> int | None:
+    """Return the most that bytes may be which convolutions see, if the largest number is one of them; None: it is not.
+
+    As a member beside others, these are divided by it only where convolutions see them.
+    """
+    image = env.image
+    if image is None or image.scale == 1.0 or not spec.hyperparams.get("conv_filters"):
+        return None
+    (keys,) = image_members(env.observation_space)
+    return round(1 / image.scale) if largest.place.startswith(named(keys)) else None
 
 
 def _on_bytes(env_id: str, largest: float, highest: int) -> Iterator[str]:

@@ -92,11 +92,11 @@ class DQNGroup:
         self._seen = seen
         self._replay, self._slots = replay, replay.slots([member.member_id for member in members])
         self._hyperparams = [member.hyperparams for member in members]
-        self._rows = StackedRows(members, seen.shape, num_actions, device)
+        self._rows = StackedRows(members, seen.shape, num_actions, device, image=seen.image)
         self._networks = self._rows.networks
         self._targets: StackedRows | None = None
         if shared.target_network:
-            self._targets = StackedRows(members, seen.shape, num_actions, device, TARGET_PREFIX)
+            self._targets = StackedRows(members, seen.shape, num_actions, device, TARGET_PREFIX, image=seen.image)
         self._optimizer = self._make_optimizer()
         self._rows.read_moments(self._optimizer)
         self._acting = make_acting(self._networks, len(members), num_envs)

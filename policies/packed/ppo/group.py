@@ -82,7 +82,7 @@ class PPOGroup:
         self._num_outputs, self._heads, self._device = num_outputs, heads, device
         self._num_masked, self._inputs = seen.num_masked, seen.unmasked
         self._prepare_bytes: Callable[[Tensor], Tensor] | None = None
-        self._rows = StackedRows(members, seen.shape, num_outputs, device)
+        self._rows = StackedRows(members, seen.shape, num_outputs, device, image=seen.image)
         self._networks = self._rows.networks
         self._shares = self._rows.networks_per_member == 1
         column = self._rows.per_row
@@ -115,6 +115,11 @@ class PPOGroup:
 
     def _per_member(self, value: Callable[[PPOHyperparams], float]) -> Tensor:
         return torch.tensor([[value(item)] for item in self._hyperparams], device=self._device, dtype=torch.float32)
+
+    @property
+    def has_convolutions(self) -> bool:
+        """Whether its networks begin with convolutions."""
+        return bool(self._networks.convolutions)
 
     def act(self, observations: NDArray[Any], prepare_bytes: PrepareBytes | None = None) -> Floats:
         """Return the policy's outputs, (M, N, A), for prepared observations, (M, N, D), or for bytes to be prepared."""

@@ -94,7 +94,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
 
     def _regroup(self) -> None:
         # What a call costs on a GPU hardly depends on how many members are in it. Of images a group keeps too much.
-        is_one_call = self._has_gpu and not self._seen.is_image
+        is_one_call = self._has_gpu and not any(member.hyperparams.conv_filters for member in self.members)
         groups = group_members(self.members, len(self.members) if is_one_call else MAX_GROUP)
         self.members = [member for group in groups for member in group]
         self.envs.arrange([member.member_id for member in self.members])
@@ -307,7 +307,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         last = fragment.last[rows]
         last = last.reshape(num_members, num_envs, -1) if self._seen.is_bytes else observations.prepare(last)
         all_seen = np.concatenate([seen, last], axis=1)
-        if self._seen.is_image:
+        if group.has_convolutions:
             # In blocks, since the windows of kernels take many times the memory of an image.
             blocks = range(0, all_seen.shape[1], _IMAGES_AT_ONCE)
             each = [self._evaluate(group, observations, all_seen[:, at : at + _IMAGES_AT_ONCE]) for at in blocks]

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from tune_jobs_test_actions import Forbidding, ForbiddingTwo, Reply
+from tune_jobs_test_members import Beside, FineBeside, MaskedBeside
 
 # The block of seeds that belongs to one trial: those of its sub-environments.
 SEEDS_PER_TRIAL = 1024
@@ -361,6 +362,9 @@ def register() -> None:
         ("TestFineShades-v0", FineShades, None),
         ("TestMaskedShades-v0", MaskedShades, None),
         ("TestBits-v0", Bits, None),
+        ("TestBeside-v0", Beside, None),
+        ("TestFineBeside-v0", FineBeside, None),
+        ("TestMaskedBeside-v0", MaskedBeside, None),
         ("TestPrecise-v0", Precise, None),
         ("TestSecret-v0", Secret, None),
         ("TestReply-v0", Reply, None),

@@ -1,0 +1,284 @@
+"""Images among other members: convolutions see them, and the dense layers what is beside them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from policy_factory import untrained_policy
+
+from policies.acting.evaluate import evaluate_policy
+from policies.acting.load import load_policy
+from policies.envs.images import SeenImage, image_member, image_members, image_seen
+from policies.envs.make import EnvInfo, check_env
+from policies.envs.masks import FORBIDDEN, MaskedBox
+from policies.errors import CheckpointError, SpecError
+from policies.hyperparams import DQNHyperparams, PPOHyperparams
+from policies.networks.parts import DQNNetworks, PPONetworks, model_config
+from policies.packed.acting import ActingNetworks, ActingOnDevice
+from policies.packed.initial import new_member
+from policies.packed.inputs import Inputs
+from policies.packed.networks import with_ones
+from policies.packed.rows import StackedRows
+from policies.portable.file import save_policy
+from tests.narrowing import present
+from tune_jobs.plan.env_checks import check_env_rules
+from tune_jobs.plan.env_notes import env_notes
+from tune_jobs.plan.estimates import products_per_image, trial_bytes
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.spec.file import load_spec
+
+pytestmark = pytest.mark.usefixtures("env_plugin")
+
+ENV, FINE, MASKED = "TestBeside-v0", "TestFineBeside-v0", "TestMaskedBeside-v0"
+SHAPE, SIZE = (12, 9, 2), 12 * 9 * 2
+NUM_SEEN = 3 + SIZE + 2
+FILTERS = ((5, 4, 2), (3, 2, 1))
+SMALL: dict[str, Any] = {"conv_filters": FILTERS, "hidden_sizes": (7,), "activation": "tanh"}
+PIXELS, GREY = spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Box(0, 7, (4, 5), np.uint8)
+GRID, FEW = spaces.Box(-1, 1, (2, 3, 1), np.float32), spaces.Box(-1, 1, (2,), np.float32)
+
+
+def flat(space: gym.Space[Any]) -> gym.Space[Any]:
+    from policies.envs.flat import FlatBox
+
+    return FlatBox(space)
+
+
+@pytest.mark.parametrize(
+    ("space", "keys", "expected"),
+    [
+        (spaces.Dict({"a": FEW, "b": PIXELS, "c": FEW}), ("b",), SeenImage((4, 5, 3), 2, 4, 1 / 255)),
+        (spaces.Tuple((GRID, spaces.Discrete(3))), (0,), SeenImage((2, 3, 1), 0, 3)),
+        (spaces.Dict({"a": spaces.Dict({"x": spaces.Discrete(2), "y": GREY})}), ("a", "y"),
+         SeenImage((4, 5, 1), 2, 2, 1 / 7)),
+        (spaces.Dict({"only": PIXELS}), ("only",), SeenImage((4, 5, 3), 0, 0, 1 / 255)),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_the_only_image_is_found_where_its_numbers_are(
+    space: gym.Space[Any], keys: tuple[Any, ...], expected: SeenImage
+) -> None:
+    made = flat(space)
+    for one in (made, MaskedBox(cast("spaces.Box", made), (3,))):
+        assert image_members(one) == {keys: expected.shape}
+        assert image_seen(one) == image_member(one) == expected
+        assert image_member(one, normalizes=True) == replace(expected, scale=1.0)
+    assert expected.num_seen == present(made.shape)[0]
+    # A number of the image is where it is said to be.
+    sample = space.sample()
+    value = sample
+    for key in keys:
+        value = value[key]
+    numbers = cast("Any", made).flat(sample)
+    assert np.array_equal(numbers[expected.start : expected.stop], np.ravel(value))
+
+
+def test_a_whole_image_is_no_member_and_of_two_there_is_none() -> None:
+    assert image_seen(PIXELS) == SeenImage((4, 5, 3))
+    assert image_seen(flat(GREY)) == SeenImage((4, 5, 1))
+    assert image_member(PIXELS) is image_member(flat(GREY)) is None
+    two = flat(spaces.Dict({"a": PIXELS, "b": GREY}))
+    assert image_members(two) == {("a",): (4, 5, 3), ("b",): (4, 5, 1)}
+    assert image_seen(two) is image_member(two) is None
+    for none in (FEW, flat(spaces.Dict({"a": FEW, "b": spaces.MultiBinary((4, 5, 3))})), spaces.Discrete(3)):
+        assert image_seen(none) is None
+
+
+# -- networks
+
+
+def observations(num: int, *, high: float = 255.0) -> NDArray[np.float32]:
+    """Vectors as of the test environment."""
+    rng = np.random.default_rng(0)
+    parts = [rng.uniform(-1, 1, (num, 3)), rng.uniform(0, high, (num, SIZE)), np.eye(2)[rng.integers(0, 2, num)]]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def info_of(env_id: str = ENV) -> EnvInfo:
+    return check_env(env_id, {})
+
+
+@pytest.mark.parametrize("normalizes", [False, True])
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_all_compute_the_same_of_what_is_observed(algorithm: str, normalizes: bool, tmp_path: Path) -> None:
+    """torch's networks, a pack's in each of its ways, and the portable policy; by hand from torch's own functions."""
+    make: Any = PPOHyperparams if algorithm == "ppo" else DQNHyperparams
+    hyperparams = make(**SMALL, normalize_observations=normalizes, **({} if algorithm == "ppo" else {"dueling": False}))
+    info, rows = info_of(), observations(20)
+    member = new_member("t0000", hyperparams, 3, info.observation_space, info.action_space)
+    build: Any = PPONetworks if algorithm == "ppo" else DQNNetworks
+    networks = build(info.observation_space, info.action_space, model_config(hyperparams))
+    weights = {name: torch.from_numpy(value) for name, value in member.weights.items()}
+    networks.load_state_dict({name: weights[name] for name in networks.state_dict()})
+    encoder = networks.encoder if algorithm == "dqn" else networks.encoder["actor_encoder"]
+    head = networks.af if algorithm == "dqn" else networks.pi
+    with torch.no_grad():
+        seen = torch.from_numpy(rows)
+        image = seen[:, 3 : 3 + SIZE].reshape(-1, *SHAPE).permute(0, 3, 1, 2)
+        x = image if normalizes else image / 255
+        for layer, stride in zip((0, 2), (2, 1), strict=True):
+            name = f"{'encoder.' if algorithm == 'ppo' else ''}{'actor_' if algorithm == 'ppo' else ''}encoder.conv"
+            of_layer = weights[f"{name}.{layer}.weight"], weights[f"{name}.{layer}.bias"]
+            x = torch.tanh(torch.nn.functional.conv2d(x, *of_layer, stride=stride))
+        x = torch.cat([x.flatten(1), seen[:, :3], seen[:, 3 + SIZE :]], dim=1)
+        expected = head(torch.tanh(torch.nn.functional.linear(x, encoder.mlp[0].weight, encoder.mlp[0].bias))).numpy()
+        found = head(encoder(seen)).numpy()
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert np.abs(expected).max() > 1e-3
+    inputs = Inputs.of(info.observation_space)
+    stacked = StackedRows([member], inputs.shape, 2, "cpu", image=inputs.image)
+    assert stacked.networks.sizes == (4 * 2 * 3 + 5, 7, 2)
+    for acting in (ActingNetworks(stacked.networks, 1), ActingOnDevice(stacked.networks, 1)):
+        np.testing.assert_allclose(acting(rows[None])[0], expected, atol=1e-5)
+    number = stacked.networks.num_networks
+    batch = torch.from_numpy(with_ones(rows[None])).repeat(number, 1, 1)
+    np.testing.assert_allclose(stacked.networks.forward(batch)[0], expected, atol=1e-5)
+    assert stacked.networks.multiplications_per_row == products_per_image(present(info.image), hyperparams) + 7 * 2
+    policy = untrained_policy(ENV, {}, hyperparams, tmp_path)
+    if not normalizes:  # of which the portable policy divides by the root of 1 + 1e-8
+        np.testing.assert_allclose(policy.outputs(rows), expected, atol=1e-5)
+    assert policy.portable.network.image == SeenImage(SHAPE, 3, 5, 1.0 if normalizes else 1 / 255)
+    # To the bit, it does not depend on what else is in a batch.
+    assert np.array_equal(np.concatenate([policy.outputs(row[None]) for row in rows]), policy.outputs(rows))
+
+
+def test_what_is_beside_the_image_and_each_pixel_matter(tmp_path: Path) -> None:
+    policy = untrained_policy(FINE, {}, PPOHyperparams(**SMALL), tmp_path)
+    row = observations(1, high=1.0)
+    before = policy.outputs(row)
+    without = [place for place in range(NUM_SEEN) if np.array_equal(policy.outputs(changed(row, place)), before)]
+    # The kernels see all rows, and 8 of 9 columns.
+    unseen = np.zeros(SHAPE, bool)
+    unseen[:, 8] = True
+    assert without == (3 + np.flatnonzero(unseen)).tolist()
+
+
+def changed(row: NDArray[np.float32], place: int) -> NDArray[np.float32]:
+    other = row.copy()
+    other[0, place] += 1
+    return other
+
+
+@pytest.mark.parametrize("env_id", [ENV, MASKED])
+def test_a_policy_takes_what_the_environment_gives(env_id: str, tmp_path: Path) -> None:
+    policy = untrained_policy(env_id, {}, PPOHyperparams(**SMALL), tmp_path)
+    env = gym.make(env_id)
+    observation, _ = env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for _ in range(9):
+        mask = observation.get("action_mask", np.ones(2, np.int8))
+        image = np.asarray(observation["image"], np.float32).ravel()
+        row = np.concatenate([observation["before"], image, np.eye(2)[observation["which"]]])
+        masked = np.concatenate([mask, row]) if "action_mask" in observation else row
+        outputs = policy.outputs(masked[None].astype(np.float32))[0]
+        assert (outputs == FORBIDDEN).tolist() == (mask == 0).tolist()
+        assert policy.act(observation) == outputs.argmax()
+        observation, *_ = env.step(int(rng.choice(np.flatnonzero(mask))))
+    assert evaluate_policy(policy, env_id=env_id, seeds=[1, 2]).lengths == (10, 10)
+
+
+def test_a_policy_file_whose_image_is_elsewhere_is_refused(tmp_path: Path) -> None:
+    policy = untrained_policy(ENV, {}, PPOHyperparams(**SMALL), tmp_path)
+    save_policy(policy.portable, tmp_path)
+    described = json.loads((tmp_path / "policy.json").read_text())
+    assert described["network"]["image"] == {"shape": [12, 9, 2], "start": 3, "num_beside": 5, "scale": 1 / 255}
+    for wrong in ({"start": 6}, {"start": -1}, {"num_beside": 4}):
+        changed = {**described, "network": {**described["network"], "image": described["network"]["image"] | wrong}}
+        (tmp_path / "policy.json").write_text(json.dumps(changed))
+        with pytest.raises(CheckpointError, match="an image of shape"):
+            load_policy(tmp_path)
+    del described["network"]["image"]
+    (tmp_path / "policy.json").write_text(json.dumps(described))
+    with pytest.raises(CheckpointError):
+        load_policy(tmp_path)
+
+
+# -- plans
+
+
+def plan_notes(env_id: str = ENV, **sweep: Any) -> list[str]:
+    return env_notes(load_spec({"env": env_id, "algorithm": "ppo", **sweep}), info_of(env_id))
+
+
+@pytest.mark.parametrize("sweep", [
+    {"hyperparams": {"conv_filters": [[5, 4, 2]]}},
+    {"space": {"conv_filters": {"choice": [None, [[5, 4, 2]]]}}},
+], ids=str)  # fmt: skip
+def test_the_plan_says_what_convolutions_see(sweep: dict[str, Any]) -> None:
+    note = (
+        "Convolutions see observation['image'], of (12, 9, 2) (rows, columns, channels); the other 5 numbers go into "
+        "the dense layers."
+    )
+    assert note in plan_notes(**sweep)
+    assert not [note for note in plan_notes() if "onvolutions" in note]
+    spec = load_spec({"env": ENV, "algorithm": "ppo", **sweep})
+    check_env_rules(spec, info_of(), [PPOHyperparams(), PPOHyperparams(conv_filters=((5, 4, 2),))])
+
+
+def test_bytes_that_convolutions_see_are_divided_and_so_not_told_as_large() -> None:
+    convolved: dict[str, Any] = {"hyperparams": {"conv_filters": [[5, 4, 2]]}}
+    assert [note for note in plan_notes() if "networks learn little" in note]
+    assert not [note for note in plan_notes(**convolved) if "networks learn little" in note]
+    # Searched with none, they are not divided in some trials.
+    searched: dict[str, Any] = {"space": {"conv_filters": {"choice": [None, [[5, 4, 2]]]}}}
+    assert [note for note in plan_notes(**searched) if "networks learn little" in note]
+
+
+def test_filters_that_do_not_fit_the_member_are_refused() -> None:
+    spec = load_spec({"env": ENV, "algorithm": "ppo"})
+    with pytest.raises(SpecError, match=r"does not fit TestBeside-v0: conv_filters\[0\] has kernels of 10") as caught:
+        check_env_rules(spec, info_of(), [PPOHyperparams(conv_filters=((4, 10, 1),))])
+    assert "smaller kernels" in caught.value.hint
+    stacked = load_spec({"env": {"id": ENV, "frame_stack": 2}, "algorithm": "ppo"})
+    with pytest.raises(SpecError, match="convolutions are for images") as caught:
+        check_env_rules(stacked, check_env(ENV, {"frame_stack": 2}), [PPOHyperparams(conv_filters=FILTERS)])
+    assert "env.frame_stack" in caught.value.hint
+
+
+def test_a_large_image_without_convolutions_is_told_with_filters_for_it() -> None:
+    screen = spaces.Box(0, 255, (40, 30, 3), np.uint8)
+    info = replace(info_of(), observation_space=flat(spaces.Dict({"health": FEW, "screen": screen})))
+    (note,) = [
+        note for note in env_notes(load_spec({"env": ENV, "algorithm": "ppo"}), info) if "beside another" in note
+    ]
+    assert note.startswith("3,600 numbers of these vectors are those of an image, observation['screen']:")
+    assert note.endswith("hyperparams.conv_filters, such as [[16, 8, 4], [32, 4, 2]], has convolutions see it.")
+
+
+def test_memory_and_work_are_counted_with_what_is_beside() -> None:
+    info, image = info_of(), present(info_of().image)
+    values = PPOHyperparams(conv_filters=((4, 3, 2),), hidden_sizes=(10,))
+    assert products_per_image(image, values) == 5 * 4 * 4 * 18 + (5 * 4 * 4 + 5) * 10
+    assert products_per_image(replace(image, num_beside=0), values) == 5 * 4 * 4 * 18 + 5 * 4 * 4 * 10
+    whole = check_env("TestShades-v0", {})
+    dqn = DQNHyperparams(conv_filters=FILTERS, replay_capacity=100_000)
+    # Numbers of four bytes each, in two observations of a transition.
+    assert trial_bytes(info, dqn) - trial_bytes(whole, dqn) > 2 * 100_000 * (3 * SIZE + 4 * 5)
+
+
+def test_weights_for_what_is_beside_are_counted() -> None:
+    def needed(num_beside: int) -> int:
+        more = spaces.Box(-1, 1, (num_beside,), np.float32)
+        info = replace(info_of(), observation_space=flat(spaces.Dict({"image": PIXELS, "more": more})))
+        small = {"train_batch_size": 16, "minibatch_size": 16, "num_envs": 1}
+        return trial_bytes(info, PPOHyperparams(conv_filters=((4, 3, 1),), hidden_sizes=(1000,), **small))
+
+    # Of 4 bytes each, in the networks of the policy and of the value function.
+    assert needed(5001) - needed(1) > 2 * 5000 * 1000 * 4
+
+
+@pytest.mark.parametrize(("filters", "engine"), [([[8, 4, 2]], "packed"), ([[64, 3, 1], [64, 3, 1]], "rllib")])
+def test_large_convolutions_are_trained_by_rllib(filters: Any, engine: str) -> None:
+    hyperparams = {"conv_filters": filters, "hidden_sizes": [64]}
+    plan = make_plan(load_spec({"env": ENV, "algorithm": "ppo", "hyperparams": hyperparams}), Machine(8, 0))
+    assert plan.engines == {engine: 1}
