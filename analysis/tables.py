@@ -15,6 +15,7 @@ from analysis.points import searched_names
 from analysis.records import FINISHED, ChangeRecord, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
 from analysis.statistics import median_steps
+from analysis.wording import listed
 from policies.files import write_atomic
 
 if TYPE_CHECKING:
@@ -46,9 +47,12 @@ _AFTER_POINT = [
 
 
 def cell_value(value: Any) -> Any:
-    """Return a sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text."""
+    """Return a sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text.
+
+    Lists in a list, as of convolutions, have a space between them: "16x8x4 32x4x2".
+    """
     if isinstance(value, list | tuple):
-        return "x".join(str(item) for item in value)
+        return listed([str(cell_value(item)) for item in value], value)
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 

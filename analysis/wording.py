@@ -123,7 +123,7 @@ def setting_text(value: Any) -> str:
     if isinstance(value, float):
         return _rounded(value, 4)
     if isinstance(value, list | tuple):
-        return "x".join(setting_text(item) for item in value)
+        return listed([setting_text(item) for item in value], value)
     return PLAIN_NONE if value is None else str(value)
 
 
@@ -131,7 +131,14 @@ def short_text(value: Any) -> str:
     """Return a hyperparameter's text where there is little room: three significant digits; 64x64 for lists."""
     if isinstance(value, float):
         return _rounded(value, 3)
-    return "x".join(map(short_text, value)) if isinstance(value, list | tuple) else setting_text(value)
+    if isinstance(value, list | tuple):
+        return listed([short_text(item) for item in value], value)
+    return setting_text(value)
+
+
+def listed(texts: Sequence[str], values: Sequence[Any]) -> str:
+    """Return the texts of a list's values as one: 64x64, and 16x8x4 32x4x2 for lists in a list."""
+    return (" " if any(isinstance(value, list | tuple) for value in values) else "x").join(texts)
 
 
 def return_text(value: float | None, *beside: float, none: str = NONE) -> str:

@@ -19,7 +19,7 @@ from analysis.importance.searched import Searched
 from analysis.points import setting_labels
 from analysis.records import IterationRecord, TrialRecord
 from analysis.report_data import goal_of
-from analysis.wording import short_text
+from analysis.wording import setting_text, short_text
 
 
 def test_a_curve_of_one_evaluation_is_seen(tmp_path: Path) -> None:
@@ -74,6 +74,13 @@ def test_values_near_one_have_the_digits_of_what_they_lack() -> None:
     assert {value: short_text(value) for value in values} == values
     assert (short_text(1.0), short_text(0.0), short_text(1.0001)) == ("1", "0", "1")
     assert setting_labels([{"gamma": 0.99}, {"gamma": 0.9904}]) == ["0.99", "0.9904"]
+
+
+def test_convolutions_are_told_apart() -> None:
+    for text in (short_text, setting_text):
+        assert text([[16, 8, 4], (32, 4, 2)]) == "16x8x4 32x4x2"
+        assert text([[16, 8, 4]]) == "16x8x4"
+        assert text((64, 32)) == "64x32"
 
 
 def test_parts_of_whole_numbers_are_told_by_those_in_them() -> None:

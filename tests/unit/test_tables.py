@@ -36,7 +36,16 @@ def iteration(number: int, *, episodes: int, training: float | None) -> Iteratio
 
 @pytest.mark.parametrize(
     ("value", "expected"),
-    [([64, 64], "64x64"), ((32,), "32"), ("relu", "relu"), (0, 0), (False, False), (None, None), (1e-7, 1e-7)],
+    [
+        ([64, 64], "64x64"),
+        ((32,), "32"),
+        ([[16, 8, 4], [32, 4, 2]], "16x8x4 32x4x2"),
+        ("relu", "relu"),
+        (0, 0),
+        (False, False),
+        (None, None),
+        (1e-7, 1e-7),
+    ],
 )
 def test_a_value_becomes_a_cell(value: Any, expected: bool | float | str | None) -> None:
     assert cell_value(value) == expected

@@ -36,10 +36,12 @@ export function significant(value, digits = 4) {
   return String(Number(text));
 }
 
-// A hyperparameter's value: 64x64 for lists.
+// A hyperparameter's value: 64x64 for lists, 16x8x4 32x4x2 for lists in a list.
 export function settingText(value, digits = 4) {
   if (value === null || value === undefined) return NONE;
-  if (Array.isArray(value)) return value.map((item) => settingText(item, digits)).join("x");
+  if (Array.isArray(value)) {
+    return value.map((item) => settingText(item, digits)).join(value.some(Array.isArray) ? " " : "x");
+  }
   if (typeof value === "number") return significant(value, digits);
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
