@@ -330,6 +330,7 @@ def _lacking_in_both(values: DQNHyperparams) -> dict[str, bool]:
     return {
         "target_network false": not values.target_network,
         "the schedule of epsilon": values.epsilon_schedule != "linear" or values.epsilon_unit != "env_step",
+        "reward_scale": values.reward_scale != 1.0,
         "updates of the target by episodes": values.target_update_unit == "episode",
     }
 

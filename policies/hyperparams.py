@@ -174,6 +174,9 @@ class DQNHyperparams(_Hyperparams):
     double_q: bool = Field(True, description="Double Q-learning (van Hasselt et al. 2016).")
     dueling: bool = Field(True, description="Dueling heads (Wang et al. 2016).")
     n_step: PositiveInt = Field(1, description="Steps of reward before bootstrapping.")
+    reward_scale: PositiveFloat = Field(
+        1.0, description="Factor of the rewards that are learned from; returns are told without it."
+    )
     td_loss: Literal["huber", "mse"] = Field("huber", description="Loss of the TD error: Huber (delta 1) or squared.")
     optimizer: Literal["adam", "rmsprop"] = Field("adam", description="Adam or RMSprop.")
     optimizer_epsilon: PositiveFloat = Field(1e-8, description="Epsilon of Adam or RMSprop.")

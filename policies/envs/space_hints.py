@@ -88,13 +88,6 @@ def one_image_hint(env_id: str, space: gym.Space[Any], images: Sequence[tuple[An
     return f"{_HOW}: `gymnasium.wrappers.FilterObservation({_make(env_id)}, {kept})` leaves the other images out."
 
 
-def smaller_rewards_hint(env_id: str, reward: float) -> str:
-    """Suggest what makes rewards of a size, without sign, of about 1."""
-    by = 10 ** max(1, round(math.log10(reward)))
-    divided = f"gymnasium.wrappers.TransformReward({_make(env_id)}, lambda reward: reward / {by})"
-    return f"{_HOW}: `{divided}` makes them smaller, in evaluations too."
-
-
 def _number(value: Any) -> str:
     return str(value.item()).replace("inf", "numpy.inf")
 

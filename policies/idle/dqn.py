@@ -150,6 +150,7 @@ DQN_RULES: dict[str, Rules] = {
             of_value=True,
         ),
     ),
+    "reward_scale": (NO_UPDATE,),
     "double_q": (NO_UPDATE, _NO_GAMMA),
     "dueling": ALWAYS,
     "n_step": (

@@ -146,8 +146,8 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
     def loss(self, batch: dict[str, Tensor], out: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return the loss, |TD errors| and Q(s, a), of shapes (), (B,) and (B,).
 
-        The target is r + discount * Q'(s', a'), where Q' is the target network (or the online one, where there is none)
-        and a' the best action by Q' or, for double Q-learning, by the online network.
+        The target is reward_scale * r + discount * Q'(s', a'), where Q' is the target network (or the online one, where
+        there is none) and a' the best action by Q' or, for double Q-learning, by the online network.
         """
         hyperparams = self.hyperparams
         q_selected = out[QF_PREDS].gather(1, batch[Columns.ACTIONS][:, None].long()).squeeze(1)
@@ -157,7 +157,7 @@ class DQNLearner(DQNTorchLearner):  # type: ignore[misc]
                 best = q_next.gather(1, out[QF_NEXT_PREDS].argmax(dim=1, keepdim=True)).squeeze(1)
             else:
                 best = q_next.max(dim=1).values
-            targets = batch[Columns.REWARDS] + batch[DISCOUNTS] * best
+            targets = hyperparams.reward_scale * batch[Columns.REWARDS] + batch[DISCOUNTS] * best
             td_errors = (q_selected - targets).abs()
         function = torch.nn.functional.huber_loss if hyperparams.td_loss == "huber" else torch.nn.functional.mse_loss
         if WEIGHTS not in batch:

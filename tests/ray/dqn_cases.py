@@ -80,11 +80,13 @@ def check_n_step(build: Build, _: object) -> None:
     assert np.median(np.abs(following[:, 0] - observations[:, 0] - 0.08 * observations[:, 1])) < 0.03
 
 
-def target_of(algo: Any, *, next_online: list[float], next_target: list[float], q: float = 0.0) -> tuple[float, float]:
-    """(loss, |TD error|) for reward 0, discount 1 and these Q-values of the next state."""
+def target_of(
+    algo: Any, *, next_online: list[float], next_target: list[float], q: float = 0.0, reward: float = 0.0
+) -> tuple[float, float]:
+    """(loss, |TD error|) for a reward, discount 1 and these Q-values of the next state."""
     batch = {
         "actions": torch.zeros(2, dtype=torch.long),
-        "rewards": torch.zeros(2),
+        "rewards": torch.full((2,), reward),
         "discounts": torch.ones(2),
     }
     out = {
@@ -102,6 +104,13 @@ def check_double_q(build: Build, _: object) -> None:
         algo = build("dqn", double_q=double_q)
         # The online network prefers action 0, the target network action 1.
         assert target_of(algo, next_online=[1.0, 0.0], next_target=[2.0, 6.0])[1] == pytest.approx(expected)
+
+
+@reaches("dqn", field="reward_scale")
+def check_reward_scale(build: Build, _: object) -> None:
+    for scale, expected in ((1.0, 4.0 + 6.0), (0.1, 0.4 + 6.0)):
+        algo = build("dqn", reward_scale=scale, double_q=False)
+        assert target_of(algo, next_online=[1.0, 0.0], next_target=[2.0, 6.0], reward=4.0)[1] == pytest.approx(expected)
 
 
 @reaches("dqn", field="td_loss")

@@ -121,6 +121,13 @@ def check_dueling() -> None:
     check_shared({"dueling": False})
 
 
+@arrives("reward_scale")
+def check_reward_scale() -> None:
+    check_update(reward_scale=0.1)
+    # Beside one that is not scaled, and alone.
+    check_update({"n_step": 2}, reward_scale=3.0)
+
+
 @arrives("td_loss")
 def check_td_loss() -> None:
     check_shared({"td_loss": "mse"})

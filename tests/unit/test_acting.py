@@ -118,6 +118,7 @@ CASES = {
     ("dqn", "train_freq"): [Case((1, 2), other=4)],
     ("dqn", "double_q"): [no_update(False, True, lr=0.1), Case((False, True), {"gamma": 0.0}, {"lr": 0.1})],
     ("dqn", "n_step"): [no_update(1, 3), Case((8, 20), other=7)],
+    ("dqn", "reward_scale"): [no_update(1.0, 0.1)],
     ("dqn", "td_loss"): [no_update("huber", "mse")],
     ("dqn", "optimizer"): [no_update("adam", "rmsprop")],
     ("dqn", "optimizer_epsilon"): [no_update(1e-8, 1e-2)],

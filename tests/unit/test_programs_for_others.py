@@ -182,6 +182,12 @@ def test_what_rllibs_optimizer_lacks_is_told() -> None:
     assert for_rllib(optimizer="rmsprop", adam_beta1=0.8).notes == ("RLlib's DQN lacks optimizer rmsprop.",)
 
 
+def test_a_scale_of_rewards_that_others_lack_is_told() -> None:
+    assert for_rllib(reward_scale=0.1).notes == ("RLlib's DQN lacks reward_scale.",)
+    scaled = DQNHyperparams(**SMALL, reward_scale=0.1)
+    assert "reward_scale" in " ".join(set(for_sb3(scaled).notes) - set(for_sb3(DQNHyperparams(**SMALL)).notes))
+
+
 def test_dense_layers_that_rllibs_heads_do_not_share_are_told() -> None:
     told = "Each head has hidden_sizes of its own: RLlib's heads share the convolutions alone."
     filters = {"conv_filters": ((4, 3, 2),)}

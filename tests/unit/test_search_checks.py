@@ -88,6 +88,12 @@ def test_a_population_refuses_to_change_what_shapes_a_network_by_name(name: str)
     load_spec({**MINIMAL, "num_samples": 4, "space": {name: {"choice": values}}})
 
 
+def test_a_population_refuses_to_change_what_rewards_are_multiplied_by() -> None:
+    space = {**LR, "reward_scale": {"loguniform": [0.01, 1]}}
+    assert "space.reward_scale: can't be changed within a trial" in errors(**PBT | {"algorithm": "dqn", "space": space})
+    load_spec({**MINIMAL, "algorithm": "dqn", "num_samples": 4, "space": space})
+
+
 def test_a_population_refuses_to_change_what_target_updates_are_counted_in() -> None:
     """The count of the last one is copied, in the other's unit."""
     space = {**LR, "target_update_unit": {"choice": ["env_step", "episode"]}}

@@ -196,25 +196,28 @@ def test_the_largest_number_of_random_play_is_behind_the_mask(monkeypatch: pytes
     assert measure_step("TestMaskedShades-v0", {}).largest == 0.0
 
 
-def on_rewards(reward: float | None, algorithm: str = "dqn", env_id: str = "CartPole-v1") -> list[str]:
-    spec = load_spec({"env": {"id": env_id}, "algorithm": algorithm})
+def on_rewards(reward: float | None, algorithm: str = "dqn", env_id: str = "CartPole-v1", **sweep: Any) -> list[str]:
+    spec = load_spec({"env": {"id": env_id}, "algorithm": algorithm, **sweep})
     packs = PackPlan(1, 1, 1.0, 0.0, (), "scalar", 5.0, 0, reward=reward)
     return [note for note in env_notes(spec, check_env(env_id, {}), packs) if "eward" in note]
 
 
 @pytest.mark.parametrize(
-    ("reward", "shown", "by"), [(300.0, "300", 100), (5.0, "5", 10), (20_000.0, "20,000", 10_000), (40.0, "40", 100)]
+    ("reward", "shown", "scale"),
+    [(300.0, "300", "0.01"), (5.0, "5", "0.1"), (20_000.0, "20,000", "0.0001"), (40.0, "40", "0.01")],
 )
-def test_dqn_is_told_of_large_rewards_with_what_divides_them(reward: float, shown: str, by: int) -> None:
+def test_dqn_is_told_of_large_rewards_with_what_scales_them(reward: float, shown: str, scale: str) -> None:
     (note,) = on_rewards(reward)
     assert note.startswith(
         f"Rewards of CartPole-v1 are of about {shown} a step: DQN's values begin near 0, and come late"
     )
-    assert note.endswith(" makes them smaller, in evaluations too. PPO hardly minds, and has normalize_rewards.")
-    env = eval(note.split("`")[1], {"gymnasium": gym})
-    env.reset(seed=0)
-    assert env.step(0)[1] == 1.0 / by
+    assert note.endswith(
+        f" hyperparams.reward_scale: {scale} has it learn from smaller ones, and changes no return. PPO hardly minds, "
+        "and has normalize_rewards."
+    )
     assert on_rewards(reward, "ppo") == []
+    assert on_rewards(reward, hyperparams={"reward_scale": float(scale)}) == []
+    assert on_rewards(reward, space={"reward_scale": {"loguniform": [1e-5, 1]}}) == []
 
 
 def test_dqn_is_not_told_of_usual_rewards() -> None:

@@ -5,6 +5,7 @@ What they bring was measured: decision 58.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import gymnasium as gym
@@ -16,14 +17,13 @@ from policies.envs.flat import named
 from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
-from policies.envs.space_hints import smaller_rewards_hint
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _FEW_TIMES = 20
 """How many times what is seen the space allows, from where that is told: MiniGrid's numbers are up to 10 of 255."""
 _SMALL, _LARGE, _LARGE_REWARD = 0.1, 10.0, 5.0
-_NORMALIZE = "normalize_observations"
+_NORMALIZE, _SCALE = "normalize_observations", "reward_scale"
 
 
 def size_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None) -> Iterator[str]:
@@ -45,7 +45,8 @@ def size_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None) -> Iterato
             yield from _on_bytes(env.env_id, abs(env.largest.value), highest)
         else:
             yield from _on_numbers(env.env_id, env.largest, None if packs is None else packs.largest)
-    if spec.algorithm == "dqn" and packs is not None and packs.reward is not None:
+    is_scaled = _SCALE in spec.space or _SCALE in spec.hyperparams
+    if spec.algorithm == "dqn" and packs is not None and packs.reward is not None and not is_scaled:
         yield from _on_rewards(env.env_id, packs.reward)
 
 
@@ -89,8 +90,8 @@ def _on_rewards(env_id: str, reward: float) -> Iterator[str]:
     if reward >= _LARGE_REWARD:
         yield (
             f"Rewards of {env_id} are of about {_short(reward)} a step: DQN's values begin near 0, and come late or "
-            f"never to sums of such rewards. {smaller_rewards_hint(env_id, reward)} PPO hardly minds, and has "
-            "normalize_rewards."
+            f"never to sums of such rewards. hyperparams.{_SCALE}: {10.0 ** -max(1, round(math.log10(reward))):g} has "
+            "it learn from smaller ones, and changes no return. PPO hardly minds, and has normalize_rewards."
         )
 
 

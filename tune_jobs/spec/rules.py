@@ -30,6 +30,8 @@ FIXED_IN_A_POPULATION: frozenset[str] = frozenset(
         "vf_share_layers", "free_log_std", "dueling", "target_network",
         # The optimizer's state would differ from the one that is copied.
         "optimizer", "rmsprop_momentum",
+        # What has been learned is of rewards times the other factor.
+        "reward_scale",
         # The last target update is counted in it.
         "target_update_unit",
         # There would be other sub-environments, by which a trial's seeds are counted.

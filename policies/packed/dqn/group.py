@@ -103,6 +103,8 @@ class DQNGroup:
         self._grad_clip = self._column(lambda item: math.inf if item.grad_clip is None else item.grad_clip)
         self._clips = any(item.grad_clip is not None for item in self._hyperparams)
         self._tau = self._column(lambda item: item.tau)
+        self._reward_scale = self._column(lambda item: item.reward_scale)
+        self._scales_rewards = any(item.reward_scale != 1.0 for item in self._hyperparams)
         self._copies = all(item.tau == 1.0 for item in self._hyperparams)
         self._moves_always = all(item.target_update_interval is None for item in self._hyperparams)
         self._has_schedule = any(item.lr_final is not None for item in self._hyperparams)
@@ -191,7 +193,8 @@ class DQNGroup:
     def _update(self, batch: Batch, *, wants_stats: bool) -> list[dict[str, float]]:
         shared, weights = self._shared, batch.weights
         next_values = self._next_values(batch.later, batch.masks, uses_double_q=shared.double_q)
-        targets = batch.rewards + batch.discounts * next_values
+        rewards = batch.rewards * self._reward_scale if self._scales_rewards else batch.rewards
+        targets = rewards + batch.discounts * next_values
         loss = dqn.loss_gradient(self._networks.forward(batch.now), batch.actions, targets, weights, shared)
         self._networks.backward(loss.gradient)
         norms = None
