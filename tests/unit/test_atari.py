@@ -15,6 +15,7 @@ from policies.envs.atari import AtariTraining
 from policies.envs.make import check_env, make_env, make_vector_env
 from policies.errors import EnvError, SpecError
 from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.memory import lowered_by_memory
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
 
@@ -325,3 +326,10 @@ def test_the_plan_knows_what_replayed_images_take_and_runs_fewer_trials_at_once(
     at_once, notes = planned(25e9, nodes=((4.0, 0.0),))
     assert at_once == 4
     assert "set resources.max_concurrent" in notes
+
+
+@pytest.mark.parametrize(("algorithm", "name"), [("dqn", "replay_capacity"), ("ppo", "train_batch_size")])
+def test_what_lowers_the_memory_of_a_trial_is_a_hyperparameter_that_it_has(algorithm: Any, name: str) -> None:
+    machine = Machine(num_cpus=4, memory_bytes=8e9)
+    _, (note,) = lowered_by_memory(machine, 5e9, 4, cpus=1.0, algorithm=algorithm)
+    assert note.endswith(f"; hyperparams.{name} is what lowers it.")

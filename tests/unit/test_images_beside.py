@@ -216,8 +216,8 @@ def plan_notes(env_id: str = ENV, **sweep: Any) -> list[str]:
 ], ids=str)  # fmt: skip
 def test_the_plan_says_what_convolutions_see(sweep: dict[str, Any]) -> None:
     note = (
-        "Convolutions see observation['image'], of (12, 9, 2) (rows, columns, channels); the other 5 numbers go into "
-        "the dense layers."
+        "Convolutions see observation['image'], of (12, 9, 2) (rows, columns, channels); the dense layers see 5 other "
+        "numbers beside it."
     )
     assert note in plan_notes(**sweep)
     assert not [note for note in plan_notes() if "onvolutions" in note]

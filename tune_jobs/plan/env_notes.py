@@ -102,7 +102,7 @@ def _note_on_image(spec: SweepSpec, env: EnvInfo, vectors: FlatBox) -> str | Non
     if images and env.image is not None and _has_convolutions(spec):
         ((keys, shape),) = images.items()
         num_beside = env.image.num_beside
-        beside = f"; the other {num_beside:,} numbers go into the dense layers" if num_beside else ""
+        beside = f"; the dense layers see {counted(num_beside, 'other number')} beside it" if num_beside else ""
         return f"Convolutions see {named(keys)}, of {shape} (rows, columns, channels){beside}."
     sizes = {keys: math.prod(leaf.shape) for keys, leaf in leaves(vectors.original, ()) if keys and _is_image(leaf)}
     keys = max(sizes, key=lambda each: sizes[each], default=())

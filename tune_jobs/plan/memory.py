@@ -1,17 +1,19 @@
 """Lower how many trials run at once, each in a process of its own, to what fits into memory; packs have other rules.
 
-What takes memory is the replay memory of DQN: 100,000 transitions of Atari's images are 5.6 GB.
+What takes memory is the replay memory of DQN, 100,000 transitions of Atari's images are 5.6 GB, or the train batch of
+PPO where observations are large: 4,000 of ViZDoom's screens as numbers of 32 bits, in three copies, are 11 GB.
 """
 
 from __future__ import annotations
 
 from analysis.wording import bytes_text, counted
+from policies.hyperparams import Algorithm
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.pack_plan import SHARE_OF_MEMORY
 
 
 def lowered_by_memory(
-    machine: Machine, num_bytes: float, concurrent: int, *, cpus: float
+    machine: Machine, num_bytes: float, concurrent: int, *, cpus: float, algorithm: Algorithm
 ) -> tuple[int, tuple[str, ...]]:
     """Return how many trials run at once, and a note where memory limits them.
 
@@ -20,6 +22,7 @@ def lowered_by_memory(
         num_bytes: The memory of the largest trial.
         concurrent: How many its CPUs and GPUs, and the sweep, allow.
         cpus: CPUs of each trial.
+        algorithm: The sweep's; it says which hyperparameter takes the most.
     """
 
     def share(at_once: int) -> float:
@@ -28,7 +31,7 @@ def lowered_by_memory(
     if machine.memory_bytes is None or num_bytes <= share(concurrent):
         return concurrent, ()
     what = f"one trial may take {bytes_text(num_bytes)} of memory"
-    lower = "hyperparams.replay_capacity is what lowers it."
+    lower = f"hyperparams.{'replay_capacity' if algorithm == 'dqn' else 'train_batch_size'} is what lowers it."
     if machine.nodes:
         # Trials that wait may begin on nodes that join, whatever is planned here.
         note = f"{counted(concurrent, 'trial')} at once get {bytes_text(share(concurrent))} of memory each, but {what}"

@@ -202,7 +202,9 @@ def make_plan(
     memory = _largest(sizes, specs, lambda _, each: trial_bytes(env, each))
     members = _members(to_run, points, memory)
     alone = max((memory[trial.point_index] for trial in to_run if not _is_packed(trial)), default=0)
-    concurrent, memory_notes = lowered_by_memory(machine, alone, concurrent, cpus=float(spec.cpus_per_trial))
+    concurrent, memory_notes = lowered_by_memory(
+        machine, alone, concurrent, cpus=float(spec.cpus_per_trial), algorithm=spec.algorithm
+    )
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
