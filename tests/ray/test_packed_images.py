@@ -180,6 +180,31 @@ def test_a_member_does_not_depend_on_the_others_to_the_bit(env_id: str, algorith
     assert weights_beside(10) == alone
 
 
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_one_that_looks_at_a_member_does_not_depend_on_one_that_sees_a_row_of_numbers(algorithm: str) -> None:
+    """Both are in one stack, as `conv_filters` may be searched beside null."""
+    from policies.packed.initial import new_member
+
+    def weights(kind: str | None) -> dict[str, bytes]:
+        stack = (
+            stack_of(BESIDE, algorithm, 1, {}, minibatch_size=20)
+            if algorithm == "ppo"
+            else stack_of(BESIDE, algorithm, 1, {})
+        )
+        if kind is not None:
+            values = stack.member("watched").hyperparams.model_copy(update={"conv_filters": None, "lr": 2e-3})
+            stack.add(new_member(kind, values, 1, stack.envs.observation_space, stack.envs.action_space), 1)
+        for _ in range(4):
+            stack.train_iteration()
+        assert len(stack._groups) == 1 + (kind is not None)
+        found = {name: value.tobytes() for name, value in stack.member("watched").weights.items()}
+        stack.envs.close()
+        return found
+
+    # By its name it may come first, or last.
+    assert weights(None) == weights("a") == weights("z")
+
+
 def test_a_member_that_was_saved_is_read_as_it_was(tmp_path: Path) -> None:
     stack = stack_of(BYTES, "ppo", 2, {}, normalize_observations=True)
     stack.train_iteration()

@@ -250,6 +250,8 @@ def test_images_that_have_to_be_made_first_are_told() -> None:
         ):
             assert (told in program.notes) is (filters is not None and flattens)
             assert ("FlattenObservation" in program.code) is (filters is None and flattens)
+            of_dicts = any("MultiInputPolicy" in note for note in program.notes)
+            assert of_dicts is (told in program.notes and "stable_baselines3" in program.code)
 
 
 def programs_of_a_report(**record: Any) -> list[next_steps.Step]:
