@@ -260,9 +260,11 @@ def test_a_pack_learns_to_look(algorithm: str, env_id: str, tmp_path: Path) -> N
             assert evaluator.run(policy).mean_return >= LEARNED
 
 
-@pytest.mark.parametrize("env_id", [BESIDE, MASKED_BESIDE])
+@pytest.mark.parametrize("env_id", [MASKED, BESIDE, MASKED_BESIDE])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_a_trial_of_rllibs_learns_to_look_at_an_image_among_others(algorithm: str, env_id: str, tmp_path: Path) -> None:
+def test_a_trial_of_rllibs_learns_to_look_at_what_is_no_plain_image(
+    algorithm: str, env_id: str, tmp_path: Path
+) -> None:
     from tune_jobs.training.rllib import RLlibEngine
 
     engine = RLlibEngine()
@@ -270,31 +272,15 @@ def test_a_trial_of_rllibs_learns_to_look_at_an_image_among_others(algorithm: st
     engine.close()
     assert progress.status == "completed", progress
     policy = load_policy(tmp_path / progress.checkpoints[-1].path)
+    # From the environment as its author registered it: no wrapper of ours.
     env, total = gym.make(env_id), 0.0
+    inner: Any = env.unwrapped
     for seed in SEEDS:
         observation, _ = env.reset(seed=seed)
         for _ in range(NUM_STEPS):
-            observation, reward, *_ = env.step(policy.act(observation))
-            total += float(reward)
-    assert total / len(SEEDS) >= LEARNED
-
-
-@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_a_trial_of_rllibs_learns_to_look_at_what_has_a_mask(algorithm: str, tmp_path: Path) -> None:
-    from tune_jobs.training.rllib import RLlibEngine
-
-    engine = RLlibEngine()
-    progress = run_trial(task_of(tmp_path, algorithm, 0, MASKED), engine)
-    engine.close()
-    assert progress.status == "completed", progress
-    policy = load_policy(tmp_path / progress.checkpoints[-1].path)
-    # From the environment as its author registered it: no wrapper of ours.
-    env, total = gym.make(MASKED), 0.0
-    inner: Any = env.unwrapped
-    for seed in SEEDS:
-        image, _ = env.reset(seed=seed)
-        for _ in range(NUM_STEPS):
-            image, reward, *_ = env.step(policy.act(image, inner.action_masks()))
+            # That of the others is among what they observe, if they have one.
+            mask = inner.action_masks() if env_id == MASKED else None
+            observation, reward, *_ = env.step(policy.act(observation, mask))
             total += float(reward)
     assert total / len(SEEDS) >= LEARNED
 
