@@ -17,6 +17,7 @@ from policy_factory import untrained_policy
 
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.load import load_policy
+from policies.envs.first_step import Largest
 from policies.envs.images import SeenImage, image_member, image_members, image_seen
 from policies.envs.make import EnvInfo, check_env
 from policies.envs.masks import FORBIDDEN, MaskedBox
@@ -232,6 +233,21 @@ def test_bytes_that_convolutions_see_are_divided_and_so_not_told_as_large() -> N
     # Searched with none, they are not divided in some trials.
     searched: dict[str, Any] = {"space": {"conv_filters": {"choice": [None, [[5, 4, 2]]]}}}
     assert [note for note in plan_notes(**searched) if "networks learn little" in note]
+
+
+@pytest.mark.parametrize(("value", "place", "told"), [
+    (10.0, "observation['image'][0][0][0]", "numbers of up to 10, and its space allows 255"),
+    (10.0, "observation['before'][0]", "numbers as large as 10 (observation['before'][0])"),
+    (100.0, "observation['image'][0][0][0]", None),
+])  # fmt: skip
+def test_bytes_of_a_member_of_which_few_are_used_are_told_as_those_of_an_image(
+    value: float, place: str, told: str | None
+) -> None:
+    info = replace(info_of(), largest=Largest(value, place))
+    spec = load_spec({"env": ENV, "algorithm": "ppo", "hyperparams": {"conv_filters": [[5, 4, 2]]}})
+    notes = [note for note in env_notes(spec, info) if "normalize_observations" in note]
+    assert len(notes) == (told is not None)
+    assert all(told is not None and told in note for note in notes)
 
 
 def test_filters_that_do_not_fit_the_member_are_refused() -> None:
