@@ -53,6 +53,12 @@ Sizes = Annotated[tuple[PositiveInt, ...], BeforeValidator(as_sizes), WithJsonSc
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    def __setstate__(self, state: dict[Any, Any]) -> None:
+        """Take over what was pickled, as in checkpoints of RLlib, with the defaults of fields that are newer."""
+        super().__setstate__(state)
+        for name, field in type(self).model_fields.items():
+            self.__dict__.setdefault(name, field.get_default(call_default_factory=True))
+
 
 class _Hyperparams(_Frozen):
     """The hyperparameters that PPO and DQN share."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.rllib.old_names import _MOVED, old_names
 from tune_jobs import restore
 
@@ -38,6 +39,18 @@ def test_a_pack_of_before_manifests_named_engines_is_restored_and_trains_on(ray_
         assert (before, algo.iteration) == (2, 3)
     finally:
         algo.stop()
+
+
+@pytest.mark.parametrize("made", [DQNHyperparams(lr=0.01), PPOHyperparams(gamma=0.9)], ids=type)
+def test_hyperparameters_pickled_before_some_were_new_have_their_defaults(made: TrainedHyperparams) -> None:
+    state = made.__getstate__()
+    for name in ("conv_filters", "initializer", "normalize_observations"):
+        del state["__dict__"][name]
+    older = type(made).__new__(type(made))
+    older.__setstate__(state)
+    assert older.initializer == "torch"
+    assert older == made
+    assert pickle.loads(pickle.dumps(made)) == made
 
 
 def test_each_old_name_leads_to_what_it_had() -> None:
