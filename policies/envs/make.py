@@ -14,7 +14,7 @@ import copy
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -101,7 +101,7 @@ class EnvInfo:
         """Whether observations are images, of shape (rows, columns, channels), and not vectors."""
         return len(seen_by_networks(self.observation_space).shape or ()) == 3
 
-    @property
+    @cached_property
     def image(self) -> SeenImage | None:
         """The image that convolutions can see, as a whole or among other members; None: there is none, or several."""
         return image_seen(self.observation_space)

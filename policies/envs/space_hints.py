@@ -82,7 +82,7 @@ def one_image_hint(env_id: str, space: gym.Space[Any], images: Sequence[tuple[An
         images: The keys that lead to each image.
     """
     dropped = {keys[0] for keys in images[1:]}
-    if not isinstance(space, gym.spaces.Dict) or any(len(keys) > 1 for keys in images):
+    if not isinstance(space, gym.spaces.Dict) or images[0][0] in dropped:
         return image_alone_hint(env_id, images[0])
     kept = [name for name in space.spaces if name not in dropped]
     return f"{_HOW}: `gymnasium.wrappers.FilterObservation({_make(env_id)}, {kept})` leaves the other images out."

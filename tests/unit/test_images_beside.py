@@ -21,6 +21,7 @@ from policies.envs.first_step import Largest
 from policies.envs.images import SeenImage, image_member, image_members, image_seen
 from policies.envs.make import EnvInfo, check_env
 from policies.envs.masks import FORBIDDEN, MaskedBox
+from policies.envs.space_hints import one_image_hint
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
 from policies.networks.parts import DQNNetworks, PPONetworks, model_config
@@ -93,6 +94,21 @@ def test_a_whole_image_is_no_member_and_of_two_there_is_none() -> None:
     assert image_seen(two) is image_member(two) is None
     for none in (FEW, flat(spaces.Dict({"a": FEW, "b": spaces.MultiBinary((4, 5, 3))})), spaces.Discrete(3)):
         assert image_seen(none) is None
+
+
+@pytest.mark.parametrize(
+    ("space", "expression"),
+    [
+        (spaces.Dict({"a": spaces.Dict({"x": PIXELS}), "b": PIXELS, "c": FEW}), "FilterObservation(gymnasium.make("),
+        (spaces.Dict({"a": spaces.Dict({"x": PIXELS, "y": PIXELS}), "c": FEW}), "seen['a']['x']"),
+        (spaces.Tuple((PIXELS, GREY)), "seen[0]"),
+    ],
+    ids=str,
+)
+def test_what_leaves_one_image_leaves_what_is_beside_it_where_it_can(space: gym.Space[Any], expression: str) -> None:
+    hint = one_image_hint("Two-v0", space, list(image_members(flat(space))))
+    assert expression in hint
+    assert ("['a', 'c'])` leaves the other images out" in hint) is expression.startswith("Filter")
 
 
 # -- networks
@@ -258,7 +274,10 @@ def test_filters_that_do_not_fit_the_member_are_refused() -> None:
     stacked = load_spec({"env": {"id": ENV, "frame_stack": 2}, "algorithm": "ppo"})
     with pytest.raises(SpecError, match="convolutions are for images") as caught:
         check_env_rules(stacked, check_env(ENV, {"frame_stack": 2}), [PPOHyperparams(conv_filters=FILTERS)])
-    assert "env.frame_stack" in caught.value.hint
+    assert caught.value.hint == (
+        "Leave hyperparams.conv_filters out, or observe images with env.pixels: true. If a member is an image, leave "
+        "env.frame_stack out, which makes one vector of all members."
+    )
 
 
 def test_a_large_image_without_convolutions_is_told_with_filters_for_it() -> None:

@@ -165,9 +165,10 @@ def _without_images(spec: SweepSpec, env: EnvInfo, place: str) -> str:
         names = " and ".join(named(keys) for keys in images)
         own = getattr(env.observation_space, "original", env.observation_space)
         return f"Leave {place} out, or observe only one of {names}. {one_image_hint(env.env_id, own, images)}"
+    stack = ""
     if spec.env.frame_stack > 1:
-        return f"Leave {place} out, or env.frame_stack: it makes one vector of all members, images among them."
-    return f"Leave {place} out, or observe images with env.{PIXELS}: true."
+        stack = " If a member is an image, leave env.frame_stack out, which makes one vector of all members."
+    return f"Leave {place} out, or observe images with env.{PIXELS}: true.{stack}"
 
 
 def filters_example(spec: SweepSpec, env: EnvInfo) -> str:
