@@ -162,7 +162,7 @@ def test_all_compute_the_same_of_what_is_observed(algorithm: str, normalizes: bo
     np.testing.assert_allclose(stacked.networks.forward(batch)[0], expected, atol=1e-5)
     assert stacked.networks.multiplications_per_row == products_per_image(present(info.image), hyperparams) + 7 * 2
     policy = untrained_policy(ENV, {}, hyperparams, tmp_path)
-    if not normalizes:  # of which the portable policy divides by the root of 1 + 1e-8
+    if not normalizes:  # which clips what it has normalised at 10, as no network here does
         np.testing.assert_allclose(policy.outputs(rows), expected, atol=1e-5)
     assert policy.portable.network.image == SeenImage(SHAPE, 3, 5, 1.0 if normalizes else 1 / 255)
     # To the bit, it does not depend on what else is in a batch.
