@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +17,7 @@ from policies.envs.flat import FlatBox, named
 
 _HOW = "Wrap it in a module of your own, as 'Spaces' in docs/guides/own-environment.md shows"
 _MAX_COMBINATIONS = 10_000
+_MOST_NAMED = 4
 
 
 def observation_hint(env_id: str, space: gym.Space[Any]) -> str:
@@ -71,6 +72,14 @@ def image_alone_hint(env_id: str, keys: tuple[Any, ...]) -> str:
         f"gymnasium.wrappers.TransformObservation({env}, lambda seen: seen{member}, {env}.observation_space{member})"
     )
     return f"{_HOW}: `{alone}` observes the image alone."
+
+
+def named_images(images: Iterable[tuple[Any, ...]]) -> str:
+    """Return what images are called, by the keys that lead to each: observation['depth'] and observation['rgb']."""
+    *names, last = map(named, images)
+    if len(names) >= _MOST_NAMED:
+        names, last = names[: _MOST_NAMED - 1], f"{len(names) + 2 - _MOST_NAMED} more"
+    return f"{', '.join(names)} and {last}" if names else last
 
 
 def one_image_hint(env_id: str, space: gym.Space[Any], images: Sequence[tuple[Any, ...]]) -> str:

@@ -35,7 +35,7 @@ class Encoder(nn.Module):
 
     Args:
         observation_space: What networks see: of shape (n,), or (height, width, channels) with convolutions. With
-            convolutions a vector has one image among the members that it is made of; the rest goes into the dense
+            convolutions a vector has an image among the members that it is made of; the rest goes into the dense
             layers, behind what the convolutions make of the image.
         hidden_sizes: Units of each dense layer.
         activation: A name of `policies.activations.ACTIVATIONS`.
@@ -108,13 +108,13 @@ class Encoder(nn.Module):
         image = self._image
         images = observations
         if image is not None:
-            images = observations[:, image.start : image.stop].reshape(-1, *image.shape)
-            images = images if image.scale == 1.0 else images * image.scale
+            members = image.members_of(observations)
+            images = members[0] if len(members) == 1 else torch.cat(members, dim=-1)
         # Environments return (height, width, channels); torch wants the channels first.
         features: Tensor = self.conv(images.permute(0, 3, 1, 2)).flatten(1)
         if image is None:
             return features
-        return torch.cat([features, observations[:, : image.start], observations[:, image.stop :]], dim=1)
+        return torch.cat([features, *image.beside_of(observations)], dim=1)
 
 
 def hidden_gain(activation: str) -> float:

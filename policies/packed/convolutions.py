@@ -123,7 +123,7 @@ class StackedConvolutions:
         self, sizes: Sequence[Convolution], activations: StackedActivations, image: SeenImage | None = None
     ) -> None:
         self.sizes, self._activations = tuple(sizes), activations
-        is_part = image is not None and (image.num_beside > 0 or image.scale != 1.0)
+        is_part = image is not None and (image.num_beside > 0 or image.more or image.scale != 1.0)
         self._image = image if is_part else None
         self._kept: list[tuple[Tensor, Kept]] = []
 
@@ -174,14 +174,16 @@ class StackedConvolutions:
 
     def _images(self, x: AnyRows) -> AnyRows:
         """Return the images, (K, B, D or more), among what is observed."""
-        if self._image is None:
+        image = self._image
+        if image is None:
             return x
-        images = x[..., self._image.start : self._image.stop]
-        return images if self._image.scale == 1.0 else images * self._image.scale
+        if not image.more:
+            images = x[..., image.places[0]]
+            return images if image.scale == 1.0 else images * image.scale
+        members = image.members_of(x)
+        joined = np.concatenate(members, axis=-1) if isinstance(x, np.ndarray) else torch.cat(members, dim=-1)
+        return joined.reshape(*x.shape[:-1], -1)
 
     def _beside(self, x: AnyRows) -> list[AnyRows]:
         """Return what is observed beside the images, in parts; empty: nothing."""
-        image = self._image
-        if image is None or not image.num_beside:
-            return []
-        return [x[..., : image.start], x[..., image.stop : image.num_seen]]
+        return [] if self._image is None else self._image.beside_of(x)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -46,7 +45,7 @@ class StackedRows:
         if not first.conv_filters:
             image = None
         elif image is not None and first.normalize_observations:
-            image = replace(image, scale=1.0)
+            image = image.unscaled
         num_beside = 0 if image is None else image.num_beside
         convolutions = convolutions_for(shape if image is None else image.shape, first.conv_filters)
         self._layouts = [

@@ -64,17 +64,16 @@ class ForwardPass:
     def _convolved(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what the convolutions make of images, and behind it, if these are part of vectors, what is beside."""
         image = self._image
-        images = x if image is None else np.ascontiguousarray(x[:, image.start : image.stop])
+        images = x
         if image is not None:
-            images = images.reshape(-1, *image.shape)
-            images = images if image.scale == 1.0 else images * np.float32(image.scale)
+            images = np.concatenate(image.members_of(x), axis=-1)
         for conv in self._conv:
             images = conv(images)
         images = images.transpose(0, 3, 1, 2)  # channels first, as torch flattens images
         if image is None:
             return images
         flat = images.reshape(len(images), -1)
-        return np.concatenate([flat, x[:, : image.start], x[:, image.stop :]], axis=1)
+        return np.concatenate([flat, *image.beside_of(x)], axis=1)
 
 
 class ForwardPasses:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.activations import ACTIVATIONS
-from policies.envs.images import SeenImage
+from policies.envs.images import Channels, SeenImage
 from policies.envs.masks import MaskedBox, seen_by_networks
 from policies.envs.own_actions import Choices, sizes_of
 from policies.errors import SpecError
@@ -149,7 +149,7 @@ def network_to_json(network: PolicyNetwork) -> tuple[dict[str, Any], Tensors]:
             tensors[f"conv.{index}.weight"] = np.ascontiguousarray(conv.weight, dtype=np.float32)
             tensors[f"conv.{index}.bias"] = np.ascontiguousarray(conv.bias, dtype=np.float32)
     if network.image is not None:
-        description["image"] = {**dataclasses.asdict(network.image), "shape": list(network.image.shape)}
+        description["image"] = _image_to_json(network.image)
     if network.module is not None:
         description["module"] = {"class": network.module.class_path, "model_config": network.module.model_config}
         for name, tensor in network.module.tensors.items():
@@ -202,12 +202,22 @@ def network_from_json(description: Mapping[str, Any], tensors: Tensors) -> Polic
     )
 
 
+def _image_to_json(image: SeenImage) -> dict[str, Any]:
+    described = {**dataclasses.asdict(image), "shape": list(image.shape)}
+    if not image.more:
+        del described["more"]
+    return described
+
+
 def _image_from_json(value: Mapping[str, Any] | None) -> SeenImage | None:
     if value is None:
         return None
     height, width, channels = (int(size) for size in value["shape"])
     start, num_beside = int(value["start"]), int(value["num_beside"])
-    return SeenImage((height, width, channels), start, num_beside, float(value["scale"]))
+    more = tuple(
+        Channels(int(each["start"]), int(each["num_channels"]), float(each["scale"])) for each in value.get("more", ())
+    )
+    return SeenImage((height, width, channels), start, num_beside, float(value["scale"]), more)
 
 
 def _action_from_json(value: Any) -> int | tuple[float, ...] | None:
@@ -275,9 +285,13 @@ def _normalization_problem(normalization: Normalization | None, shape: tuple[int
 
 def _image_problem(image: SeenImage | None, shape: tuple[int, ...]) -> str:
     """Return why an image is not among the numbers of vectors of a shape."""
-    if image is None or (shape == (image.num_seen,) and image.start >= 0 and image.stop <= image.num_seen):
+    if image is None:
         return ""
-    return f"an image of shape {image.shape} from number {image.start} on is not in observations of shape {shape}"
+    bounds = [0, *(bound for place in image.places for bound in (place.start, place.stop)), image.num_seen]
+    if shape == (image.num_seen,) and bounds == sorted(bounds):
+        return ""
+    starts = " and ".join(str(part.start) for part in image.parts)
+    return f"an image of shape {image.shape} from number {starts} on is not in observations of shape {shape}"
 
 
 def _conv_problem(conv: tuple[ConvLayer, ...], shape: tuple[int, ...]) -> str:

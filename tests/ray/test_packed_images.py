@@ -36,6 +36,8 @@ pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 BYTES, NUMBERS, MASKED, BITS = "TestShades-v0", "TestFineShades-v0", "TestMaskedShades-v0", "TestBits-v0"
 # An image of the same size among other members.
 BESIDE, FINE_BESIDE, MASKED_BESIDE = "TestBeside-v0", "TestFineBeside-v0", "TestMaskedBeside-v0"
+# Two images of that size, of two channels and of one.
+PAIR = "TestPair-v0"
 FILTERS = ((5, 4, 2), (3, 2, 1))
 """12 x 9 x 2 -> 5 x 3 x 5 -> 4 x 2 x 3."""
 # As in `packed_rllib` and `packed_dqn`, but the gradient of a kernel is a sum over its 15 places in each row, too.
@@ -74,6 +76,10 @@ PPO: dict[str, tuple[str, dict[str, Any], list[dict[str, Any]]]] = {
         [{"hidden_sizes": (8, 6)}, {"hidden_sizes": (7, 5), "entropy_coeff": 0.1}],
     ),
     "bytes beside others and a mask": (MASKED_BESIDE, {"conv_filters": FILTERS}, [{}, {"hidden_sizes": (5,)}]),
+    "two images": (PAIR, {"conv_filters": FILTERS}, [{}, {"hidden_sizes": (5,), "grad_clip": 0.3}]),
+    "two images, normalised, shared layers": (
+        PAIR, {"conv_filters": FILTERS, "normalize_observations": True, "vf_share_layers": True}, [{}, {"lr": 1e-3}],
+    ),
 }  # fmt: skip
 DQN: dict[str, tuple[str, list[dict[str, Any]]]] = {
     "bytes, double, dueling": (BYTES, [
@@ -102,6 +108,7 @@ DQN: dict[str, tuple[str, list[dict[str, Any]]]] = {
         {"conv_filters": ((4, 3, 2),), "normalize_observations": True, "tau": 0.2, "dueling": False},
     ]),
     "bytes beside others and a mask": (MASKED_BESIDE, [{"conv_filters": FILTERS, "n_step": 2}]),
+    "two images, double, dueling": (PAIR, [{"conv_filters": FILTERS}, {"conv_filters": FILTERS, "hidden_sizes": (5,)}]),
 }  # fmt: skip
 
 
@@ -162,6 +169,8 @@ def stack_of(env_id: str, algorithm: str, num_members: int, env_args: dict[str, 
     (MASKED, "dqn", {"normalize_observations": True}),
     (BESIDE, "ppo", {"minibatch_size": 20}),
     (MASKED_BESIDE, "dqn", {}),
+    (PAIR, "ppo", {"minibatch_size": 20}),
+    (PAIR, "dqn", {}),
     (NUMBERS, "dqn", {"normalize_observations": True, "activation": "gelu"}),
 ])  # fmt: skip
 def test_a_member_does_not_depend_on_the_others_to_the_bit(env_id: str, algorithm: str, values: dict[str, Any]) -> None:
@@ -251,7 +260,7 @@ def task_of(folder: Path, algorithm: str, seed: int, env_id: str = BYTES) -> Tri
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("env_id", [BYTES, MASKED, BITS, BESIDE, MASKED_BESIDE])
+@pytest.mark.parametrize("env_id", [BYTES, MASKED, BITS, BESIDE, MASKED_BESIDE, PAIR])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_a_pack_learns_to_look(algorithm: str, env_id: str, tmp_path: Path) -> None:
     tasks = [task_of(tmp_path, algorithm, seed, env_id) for seed in range(2)]
@@ -260,7 +269,7 @@ def test_a_pack_learns_to_look(algorithm: str, env_id: str, tmp_path: Path) -> N
             assert evaluator.run(policy).mean_return >= LEARNED
 
 
-@pytest.mark.parametrize("env_id", [MASKED, BESIDE, MASKED_BESIDE])
+@pytest.mark.parametrize("env_id", [MASKED, BESIDE, MASKED_BESIDE, PAIR])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_a_trial_of_rllibs_learns_to_look_at_what_is_no_plain_image(
     algorithm: str, env_id: str, tmp_path: Path
@@ -311,7 +320,10 @@ def test_a_checkpoint_of_images_that_were_scaled_otherwise_does_not_go_on(tmp_pa
         algorithm_from_checkpoint(folder)
 
 
-@pytest.mark.parametrize(("algorithm", "env_id"), [("ppo", BYTES), ("dqn", BYTES), ("ppo", BESIDE), ("dqn", BESIDE)])
+@pytest.mark.parametrize(
+    ("algorithm", "env_id"),
+    [("ppo", BYTES), ("dqn", BYTES), ("ppo", BESIDE), ("dqn", BESIDE), ("ppo", PAIR), ("dqn", PAIR)],
+)
 def test_a_checkpoint_goes_on_and_is_an_rllib_algorithm(algorithm: str, env_id: str, tmp_path: Path) -> None:
     from policies.packed.to_rllib import algorithm_from_checkpoint
     from tune_jobs.training.packed import PackedEngine
@@ -333,6 +345,9 @@ def test_a_checkpoint_goes_on_and_is_an_rllib_algorithm(algorithm: str, env_id: 
     images: Any = rng.integers(0, 256, (100, 12, 9, 2), dtype=np.uint8)
     if env_id == BESIDE:
         parts = [rng.normal(size=(100, 3)), images.reshape(100, -1), np.eye(2)[rng.integers(0, 2, 100)]]
+        images = np.concatenate(parts, axis=1).astype(np.float32)
+    if env_id == PAIR:
+        parts = [np.eye(2)[rng.integers(0, 2, 100)], images.reshape(100, -1), rng.normal(size=(100, 3 + 108 + 3))]
         images = np.concatenate(parts, axis=1).astype(np.float32)
     with torch.no_grad():
         module = rllib.get_module(packed_rllib.MODULE)

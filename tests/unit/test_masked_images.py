@@ -122,18 +122,19 @@ def test_a_board_of_whole_numbers_is_an_image_too() -> None:
 
 
 class Hand(Board):
-    """Two boards beside other members."""
+    """Two boards beside other members, one of which lies on its side."""
 
     def __init__(self, *, has_mask: bool) -> None:
         mask = {"action_mask": gym.spaces.MultiBinary(7)} if has_mask else {}
+        last = gym.spaces.Box(0, 1, (7, 6, 2), np.int8)
         self.observation_space = gym.spaces.Dict(
-            {"cards": gym.spaces.Discrete(3), "board": Board.observation_space, "last": Board.observation_space, **mask}
+            {"cards": gym.spaces.Discrete(3), "board": Board.observation_space, "last": last, **mask}
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         board, info = super().reset(seed=seed)
         mask = {"action_mask": info["legal"]} if "action_mask" in self.observation_space.spaces else {}
-        return {"cards": 1, "board": board, "last": board, **mask}, {}
+        return {"cards": 1, "board": board, "last": board.swapaxes(0, 1), **mask}, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         return self.reset()[0], 0.0, True, False, {}

@@ -11,13 +11,12 @@ import numpy as np
 
 from policies.acting.baselines import BASELINES
 from policies.envs.failures import check_failure_penalty
-from policies.envs.flat import named
 from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices
-from policies.envs.space_hints import channels_last_hint, one_image_hint
+from policies.envs.space_hints import channels_last_hint, named_images, one_image_hint
 from policies.envs.wrappers import PIXELS, RESERVED
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
@@ -155,16 +154,17 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
 
 def _several_images(env: EnvInfo) -> str:
     images = image_members(env.observation_space)
-    return f", with {len(images)} images among their members" if images else ""
+    return f", with {len(images)} images among their members, of different sizes" if images else ""
 
 
 def _without_images(spec: SweepSpec, env: EnvInfo, place: str) -> str:
     """Return what to do about convolutions where vectors are observed: several members of them may be images."""
     images = list(image_members(env.observation_space))
     if images:
-        names = " and ".join(named(keys) for keys in images)
         own = getattr(env.observation_space, "original", env.observation_space)
-        return f"Leave {place} out, or observe only one of {names}. {one_image_hint(env.env_id, own, images)}"
+        names, hint = named_images(images), one_image_hint(env.env_id, own, images)
+        together = "Those of one height and width are seen together, as the channels of one."
+        return f"Leave {place} out, or observe only one of {names}. {together} {hint}"
     stack = ""
     if spec.env.frame_stack > 1:
         stack = " If a member is an image, leave env.frame_stack out, which makes one vector of all members."

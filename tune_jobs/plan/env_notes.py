@@ -18,7 +18,7 @@ from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices, is_made
-from policies.envs.space_hints import image_alone_hint
+from policies.envs.space_hints import image_alone_hint, named_images
 from policies.errors import shortened
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.env_checks import channels_hint, filters_example
@@ -100,15 +100,15 @@ def _note_on_image(spec: SweepSpec, env: EnvInfo, vectors: FlatBox) -> str | Non
     """Return a note on the largest image among members that are made one vector; None: none is large, or seen."""
     images = image_members(env.observation_space)
     if images and env.image is not None and _has_convolutions(spec):
-        ((keys, shape),) = images.items()
-        num_beside = env.image.num_beside
+        num_beside, shape = env.image.num_beside, env.image.shape
         beside = f"; the dense layers see {counted(num_beside, 'other number')} beside it" if num_beside else ""
-        return f"Convolutions see {named(keys)}, of {shape} (rows, columns, channels){beside}."
+        joined = " as the channels of one image" if len(images) > 1 else ""
+        return f"Convolutions see {named_images(images)}{joined}, of {shape} (rows, columns, channels){beside}."
     sizes = {keys: math.prod(leaf.shape) for keys, leaf in leaves(vectors.original, ()) if keys and _is_image(leaf)}
     keys = max(sizes, key=lambda each: sizes[each], default=())
     if not keys or sizes[keys] < _FEW_NUMBERS:
         return None
-    if list(images) == [keys]:
+    if env.image is not None and keys in images:
         hint = f"hyperparams.conv_filters, such as {filters_example(spec, env)}, has convolutions see it."
     elif env.mask is None:
         hint = image_alone_hint(env.env_id, keys)

@@ -55,11 +55,12 @@ def _highest_of_convolved(spec: SweepSpec, env: EnvInfo, largest: Largest) -> in
 
     As a member beside others, these are divided by it only where convolutions see them.
     """
-    image = env.image
-    if image is None or image.scale == 1.0 or not spec.hyperparams.get("conv_filters"):
+    if env.image is None or not spec.hyperparams.get("conv_filters"):
         return None
-    (keys,) = image_members(env.observation_space)
-    return round(1 / image.scale) if largest.place.startswith(named(keys)) else None
+    for keys, part in zip(image_members(env.observation_space), env.image.parts, strict=False):
+        if largest.place.startswith(named(keys)) and part.scale != 1.0:
+            return round(1 / part.scale)
+    return None
 
 
 def _on_bytes(env_id: str, largest: float, highest: int) -> Iterator[str]:

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from tune_jobs_test_actions import Forbidding, ForbiddingTwo, Reply
-from tune_jobs_test_members import Beside, FineBeside, MaskedBeside
+from tune_jobs_test_members import Beside, FineBeside, MaskedBeside, Pair
 
 # The block of seeds that belongs to one trial: those of its sub-environments.
 SEEDS_PER_TRIAL = 1024
@@ -365,6 +365,7 @@ def register() -> None:
         ("TestBeside-v0", Beside, None),
         ("TestFineBeside-v0", FineBeside, None),
         ("TestMaskedBeside-v0", MaskedBeside, None),
+        ("TestPair-v0", Pair, None),
         ("TestPrecise-v0", Precise, None),
         ("TestSecret-v0", Secret, None),
         ("TestReply-v0", Reply, None),

@@ -61,6 +61,40 @@ class Beside(gym.Env[Any, Any]):
         return self._observation(), reward, self.ticks >= 10, False, {}
 
 
+class Pair(Beside):
+    """Two images of one size: the right action tells whether their brighter halves are the same.
+
+    Who sees one of them is right half of the time. One is of bytes and the other of numbers from 0 to 1, with numbers
+    without meaning before, between and behind them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = gym.spaces.Dict(
+            {
+                "a_die": gym.spaces.Discrete(2),
+                "color": self._image,
+                "counts": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
+                "depth": gym.spaces.Box(0.0, 1.0, (12, 9, 1), np.float32),
+                "digit": gym.spaces.Discrete(3),
+            }
+        )
+
+    def _observation(self) -> dict[str, Any]:
+        half, other = (int(number) for number in self.np_random.integers(2, size=2))
+        self.right = int(half == other)
+        color, depth = self.np_random.uniform(0.0, 0.5, (12, 9, 2)), self.np_random.uniform(0.0, 0.5, (12, 9, 1))
+        color[6 * half : 6 * (half + 1)] += 0.5
+        depth[6 * other : 6 * (other + 1)] += 0.5
+        return {
+            "a_die": self.np_random.integers(2),
+            "color": (color * 255).astype(np.uint8),
+            "counts": self.np_random.uniform(-1.0, 1.0, 3).astype(np.float32),
+            "depth": depth.astype(np.float32),
+            "digit": self.np_random.integers(3),
+        }
+
+
 class FineBeside(Beside):
     """The same of numbers from 0 to 1."""
 
