@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.envs.faults import close_env, env_failed
-from policies.envs.flat import FlatBox
 from policies.envs.masks import num_masked, seen_by_networks
+from policies.envs.stacked import WithMembers
 from policies.envs.tallies import only_tally
 from policies.errors import EnvError, EnvFailedError
 
@@ -110,7 +110,7 @@ def check_observation(observation: Any, env_id: str, num_steps: int, space: gym.
 def _where(values: NDArray[Any], place: int, space: gym.Space[Any] | None) -> str:
     """Return where the env itself has a number of what is observed, which may begin with a mask."""
     before = 0 if space is None else num_masked(space)
-    if space is not None and isinstance(seen := seen_by_networks(space), FlatBox):
+    if space is not None and isinstance(seen := seen_by_networks(space), WithMembers):
         return seen.name_of(place - before)
     return f"number {place - before} of its {values.size - before}, counted from 0"
 

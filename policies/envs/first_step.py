@@ -22,6 +22,7 @@ from policies.envs.mask_hints import mask_hint
 from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.masks import NoMaskError, num_masked, sample, seen_by_networks
 from policies.envs.own_actions import is_made
+from policies.envs.stacked import WithMembers
 from policies.errors import EnvError, shortened
 
 _STEP_HINT = (
@@ -250,7 +251,7 @@ def _not_finite(array: NDArray[Any], space: gym.Space[Any]) -> str | None:
 def _place_in(space: gym.Space[Any], number: int) -> str:
     """Name the place of a number in the environment's own observation: behind the mask, if there is one."""
     seen, number = seen_by_networks(space), number - num_masked(space)
-    if isinstance(seen, FlatBox):
+    if isinstance(seen, WithMembers):
         return seen.name_of(number)
     return str([int(index) for index in np.unravel_index(number, seen.shape or ())])
 

@@ -1,8 +1,8 @@
 """Which of the numbers that networks see of an observation are an image, over which convolutions can go.
 
 An observation is an image as a whole, or the vector that `policies.envs.flat` makes of several members, some of which
-are images of one height and width: those are the channels of one image. The rest of a vector goes into the dense
-layers, beside what the convolutions make of the image.
+are images of one height and width: those are the channels of one image, as those of the last observations are where
+several are seen at once. The rest of a vector goes into the dense layers, beside what the convolutions make of it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any, TypeVar, cast
 import gymnasium as gym
 import numpy as np
 
-from policies.envs.flat import FlatBox
 from policies.envs.masks import seen_by_networks
+from policies.envs.stacked import WithMembers
 
 _IMAGE = 3
 """The dimensions of an image."""
@@ -117,14 +117,14 @@ def image_member(space: gym.Space[Any], *, normalizes: bool = False) -> SeenImag
     if len(sizes) != 1:
         return None
     seen = seen_by_networks(space)
-    assert isinstance(seen, FlatBox)
+    assert isinstance(seen, WithMembers)
     first, *more = (
         Channels(start, images[keys][2], scale_of_bytes(leaf))
         for keys, leaf, start, _ in seen.places()
         if keys in images
     )
     ((height, width),) = sizes
-    shape = height, width, sum(channels for *_, channels in images.values())
+    shape = height, width, first.num_channels + sum(each.num_channels for each in more)
     num_beside = math.prod(seen.shape) - math.prod(shape)
     image = SeenImage(shape, first.start, num_beside, first.scale, tuple(more))
     return image.unscaled if normalizes else image
@@ -133,10 +133,12 @@ def image_member(space: gym.Space[Any], *, normalizes: bool = False) -> SeenImag
 def image_members(space: gym.Space[Any]) -> dict[tuple[Any, ...], tuple[int, int, int]]:
     """Return the members that are images, by the keys that lead to them, and their shapes; a whole image is no member.
 
+    Where several observations are seen at once, a member has as many images of that shape.
+
     An image is a Box of three dimensions, or bytes in two, which are one channel.
     """
     seen = seen_by_networks(space)
-    if not isinstance(seen, FlatBox) or len(seen.shape) != 1:
+    if not isinstance(seen, WithMembers) or len(seen.shape) != 1:
         return {}
     found = {}
     for keys, leaf, _, _ in seen.places():

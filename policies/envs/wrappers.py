@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from policies.envs.atari import ATARI, AtariFrames
 from policies.envs.failures import FailureRule
-from policies.envs.flat import flattened
+from policies.envs.flat import FlatBox, flattened
 from policies.envs.mask_settings import ACTION_MASK, Setting, check_setting
 from policies.envs.masks import MaskedBox, masked, num_masked
 from policies.envs.own_actions import with_own_actions
 from policies.envs.own_process import OWN_PROCESS
 from policies.envs.rendering import picture_of
+from policies.envs.stacked import StackedBox
 from policies.envs.training_view import TrainingView
 from policies.errors import EnvError
 
@@ -243,6 +244,8 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
     with np.errstate(over="ignore"):
         low, high = (np.concatenate([bound] * num_frames, axis=-1).astype(dtype) for bound in (seen.low, seen.high))
     stacked = gym.spaces.Box(low, high, dtype=dtype.type)
+    if isinstance(seen, FlatBox) and len(seen.shape) == 1:
+        stacked = StackedBox(seen, num_frames)
     return MaskedBox(stacked, space.sizes, lists_from=space.lists_from) if isinstance(space, MaskedBox) else stacked
 
 

@@ -143,7 +143,7 @@ def _check_networks(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence[Any]) -
             raise SpecError(
                 f"{place} is {[list(one) for one in filters]}, but the observations of {env.env_id} are flat, of shape "
                 f"{shape}{_several_images(env)}: convolutions are for images.",
-                _without_images(spec, env, place),
+                _without_images(env, place),
             )
         try:
             output_shape(env.image.shape, filters)
@@ -157,7 +157,7 @@ def _several_images(env: EnvInfo) -> str:
     return f", with {len(images)} images among their members, of different sizes" if images else ""
 
 
-def _without_images(spec: SweepSpec, env: EnvInfo, place: str) -> str:
+def _without_images(env: EnvInfo, place: str) -> str:
     """Return what to do about convolutions where vectors are observed: several members of them may be images."""
     images = list(image_members(env.observation_space))
     if images:
@@ -165,10 +165,7 @@ def _without_images(spec: SweepSpec, env: EnvInfo, place: str) -> str:
         names, hint = named_images(images), one_image_hint(env.env_id, own, images)
         together = "Those of one height and width are seen together, as the channels of one."
         return f"Leave {place} out, or observe only one of {names}. {together} {hint}"
-    stack = ""
-    if spec.env.frame_stack > 1:
-        stack = " If a member is an image, leave env.frame_stack out, which makes one vector of all members."
-    return f"Leave {place} out, or observe images with env.{PIXELS}: true.{stack}"
+    return f"Leave {place} out, or observe images with env.{PIXELS}: true."
 
 
 def filters_example(spec: SweepSpec, env: EnvInfo) -> str:

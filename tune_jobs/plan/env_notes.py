@@ -19,6 +19,7 @@ from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices, is_made
 from policies.envs.space_hints import image_alone_hint, named_images
+from policies.envs.stacked import StackedBox, WithMembers
 from policies.errors import shortened
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.env_checks import channels_hint, filters_example
@@ -43,12 +44,14 @@ def env_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None = None) -> l
 
 def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
     seen = seen_by_networks(env.observation_space)
-    if isinstance(seen, FlatBox):
+    if isinstance(seen, WithMembers):
         kind = "images of shape" if env.observes_images else "vectors of shape"
-        yield f"Observations of {env.env_id} are made {kind} {seen.shape}: {shortened(seen.original)}."
-        if spec.rl_module is None and spec.algorithm not in BASELINES and (note := _note_on_image(spec, env, seen)):
+        frame, frames = (seen.frame, seen.num_frames) if isinstance(seen, StackedBox) else (seen, 1)
+        at_once = f", {frames} observations in each" if frames > 1 else ""
+        yield f"Observations of {env.env_id} are made {kind} {seen.shape}{at_once}: {shortened(frame.original)}."
+        if spec.rl_module is None and spec.algorithm not in BASELINES and (note := _note_on_image(spec, env, frame)):
             yield note
-        if note := _note_on_choices(seen):
+        if note := _note_on_choices(frame):
             yield note
     if env.observes_images and spec.rl_module is None and (hint := channels_hint(spec, env)):
         # With filters that do not fit it is an error, which says the same.
@@ -102,8 +105,12 @@ def _note_on_image(spec: SweepSpec, env: EnvInfo, vectors: FlatBox) -> str | Non
     if images and env.image is not None and _has_convolutions(spec):
         num_beside, shape = env.image.num_beside, env.image.shape
         beside = f"; the dense layers see {counted(num_beside, 'other number')} beside it" if num_beside else ""
-        joined = " as the channels of one image" if len(images) > 1 else ""
-        return f"Convolutions see {named_images(images)}{joined}, of {shape} (rows, columns, channels){beside}."
+        frames = spec.env.frame_stack
+        stacked = f" of the last {frames} observations" if frames > 1 else ""
+        joined = " as the channels of one image" if env.image.more else ""
+        return (
+            f"Convolutions see {named_images(images)}{stacked}{joined}, of {shape} (rows, columns, channels){beside}."
+        )
     sizes = {keys: math.prod(leaf.shape) for keys, leaf in leaves(vectors.original, ()) if keys and _is_image(leaf)}
     keys = max(sizes, key=lambda each: sizes[each], default=())
     if not keys or sizes[keys] < _FEW_NUMBERS:
