@@ -25,6 +25,7 @@ from analysis.wording import counted, return_text, shown_path
 from policies import random_streams
 from policies.acting.movies import still_of
 from policies.envs.mask_settings import ACTION_MASK, METHOD, names_in
+from policies.envs.wrappers import wrapped_by
 from policies.errors import CheckpointError, NotFoundError
 from policies.portable.file import read_policy
 
@@ -159,12 +160,21 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
 
 
 def acting_code(folder: Path) -> str:
-    """Return how the policy in a folder acts, as Python: with a mask beside the observation if it takes one so."""
+    """Return how the policy in a folder acts, as Python.
+
+    What an environment with wrappers of ours observes comes from one that is made with them; a mask is beside the
+    observation if the policy takes it so.
+    """
     try:
         policy = read_policy(folder)
     except (CheckpointError, NotFoundError):
         # It is in an object store, or not written yet.
         return "action = policy.act(observation)"
+    if wrapped := wrapped_by(policy.env_args):
+        return (
+            f"env = policy.make_env()  # with {wrapped}\nobservation, info = env.reset()\n"
+            "action = policy.act(observation)"
+        )
     if not policy.needs_mask:
         return "action = policy.act(observation)"
     # As `policies.envs.masks` finds it: a mask that was not asked for is a method's, and a method goes before an info.

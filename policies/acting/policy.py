@@ -28,11 +28,12 @@ from typing_extensions import override
 from policies import random_streams
 from policies.envs.action_bounds import ToBounds
 from policies.envs.flat import FlatBox
-from policies.envs.make import check_env
+from policies.envs.make import check_env, make_env
 from policies.envs.mask_hints import argument_hint
 from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.masks import FORBIDDEN, MaskedBox, draw_allowed, num_masked, seen_by_networks
-from policies.envs.own_actions import Choices, is_made, own_actions
+from policies.envs.own_actions import Choices, TakesOwnActions, is_made, own_actions
+from policies.envs.wrappers import wrapped_by
 from policies.errors import NonFiniteWeightsError, ObservationError, TuneJobsError
 from policies.portable.file import (
     ActionTransform,
@@ -106,7 +107,7 @@ class Policy(ABC):
                 observations = space.flat_or_own(observations)
             batch = np.asarray(observations, dtype=np.float32)
         except (TypeError, ValueError) as error:
-            hint = "Pass what env.reset or env.step returned"
+            hint = self._what_to_pass()
             if isinstance(space, MaskedBox):
                 hint += argument_hint(space, self.env_args.get(ACTION_MASK))
             raise ObservationError(
@@ -117,7 +118,7 @@ class Policy(ABC):
             raise ObservationError(
                 f"The observations are of shape {batch.shape}; this policy ({self.env_id}) takes one of "
                 f"shape {shape}, or a batch of them.",
-                "Pass what env.reset or env.step returned.",
+                f"{self._what_to_pass()}.",
             )
         actions = self._act_batch(batch[None] if single else batch)
         if not single:
@@ -125,6 +126,21 @@ class Policy(ABC):
         if is_made(self.action_space):
             return self.action_space.own(actions[0])
         return int(actions[0]) if isinstance(self.action_space, gym.spaces.Discrete) else actions[0]
+
+    def make_env(self, *, render_mode: str | None = None) -> gym.Env[Any, Any]:
+        """Make the environment that it was trained in: `act` takes what that observes, and it takes what `act` gives.
+
+        It has the arguments and the time limit of training, and the wrappers: frames that are stacked, pixels, those of
+        Atari's games, and a mask of actions, which is then among what is observed.
+
+        Args:
+            render_mode: One of the environment's, as `human` or `rgb_array`; None: nothing is drawn.
+
+        Raises:
+            EnvError: It cannot be made here, or its module is not allowed (`tune_jobs.allow_modules`).
+        """
+        env = make_env(self.env_id, self.env_args, render_mode=render_mode)
+        return TakesOwnActions(env, env.action_space.original) if is_made(env.action_space) else env
 
     def act_on_row(self, observation: NDArray[Any]) -> Action:
         """Return the greedy action for one vector or image, as environments of `policies.envs.make` take it."""
@@ -144,6 +160,13 @@ class Policy(ABC):
                 actions = [space.given_for(action) for action in actions]
             return np.asarray(actions)
         return self._act_batch(np.asarray(observations, dtype=np.float32))
+
+    def _what_to_pass(self) -> str:
+        """Return what `act` takes, for hints."""
+        passed, wrapped = "Pass what env.reset or env.step returned", wrapped_by(self.env_args)
+        if not wrapped:
+            return passed
+        return f"{passed}, of an env with {wrapped}, with which it was trained: env = policy.make_env()"
 
     def _wanted(self) -> str:
         space = self.observation_space

@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeGuard
 
 import gymnasium as gym
@@ -137,6 +138,13 @@ class Numbers(gym.spaces.Box):
 Made: TypeAlias = Choices | Numbers
 
 
+@dataclass(frozen=True)
+class _OwnAction:
+    """An action that is in the environment's own form already."""
+
+    value: Any
+
+
 class TakesActions(gym.ActionWrapper[Any, Any, Any]):
     """Takes the actions of `Choices` or `Numbers`."""
 
@@ -146,7 +154,19 @@ class TakesActions(gym.ActionWrapper[Any, Any, Any]):
 
     def action(self, action: Any) -> Any:
         """Return an action as the environment takes it."""
-        return self._space.own(np.asarray(action))
+        return action.value if isinstance(action, _OwnAction) else self._space.own(np.asarray(action))
+
+
+class TakesOwnActions(gym.ActionWrapper[Any, Any, Any]):
+    """Takes actions in the environment's own form, as `Policy.act` gives them, around all other wrappers."""
+
+    def __init__(self, env: gym.Env[Any, Any], original: gym.Space[Any]) -> None:
+        super().__init__(env)
+        self.action_space = copy.deepcopy(original)
+
+    def action(self, action: Any) -> Any:
+        """Return an action that `TakesActions` leaves as it is."""
+        return _OwnAction(action)
 
 
 def is_taken(space: gym.Space[Any]) -> bool:

@@ -158,6 +158,15 @@ def with_wrappers(
     return wrapped
 
 
+def wrapped_by(env_args: Mapping[str, Any]) -> str:
+    """Return what changes an environment's observations, as a sweep file has it: `frame_stack: 4 and atari`."""
+    frames = env_args.get(FRAME_STACK, 1)
+    found = [f"{FRAME_STACK}: {frames}"] if frames != 1 else []
+    found += [f"{PIXELS}: true"] if env_args.get(PIXELS) else []
+    found += [ATARI] if env_args.get(ATARI) is not None else []
+    return " and ".join(found)
+
+
 def constructor_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
     """Return env arguments without the reserved keys."""
     return {name: value for name, value in env_args.items() if name not in RESERVED}
