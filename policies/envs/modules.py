@@ -127,8 +127,9 @@ def import_module_allowed(module: str) -> ModuleType:
     if not is_allowed(module):
         raise SpecError(
             f"The Python module {module!r} is not allowed: importing it would run its code.",
-            f"If you trust it, allow it with --allow-module {module}, or in Python by passing the class itself; the "
-            f"environment variable {ENVIRONMENT_VARIABLE}={module} does the same.",
+            f"If you trust it, allow it with --allow-module {module}, or in Python with "
+            f"tune_jobs.allow_modules([{module!r}]); the environment variable {ENVIRONMENT_VARIABLE}={module} does the "
+            "same.",
         )
     here = os.getcwd()  # noqa: PTH109 (sys.path holds strings)
     if module in _SHARED and here not in sys.path:

@@ -160,6 +160,14 @@ def test_atari_is_told_without_its_numbers(tmp_path: Path) -> None:
     env.close()
 
 
+def test_a_module_that_is_not_allowed_says_how_python_allows_it(tmp_path: Path) -> None:
+    policy = saved("CartPole-v1", {}, tmp_path)
+    policy.env_id = "my_own_envs:Lake"
+    with pytest.raises(EnvError, match="'my_own_envs' is not allowed") as caught:
+        policy.make_env()
+    assert "in Python with tune_jobs.allow_modules(['my_own_envs'])" in caught.value.hint
+
+
 def test_masks_come_with_what_it_observes(tmp_path: Path) -> None:
     """Where frames are stacked below a mask, they are one row."""
     made = untrained_policy(
