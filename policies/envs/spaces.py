@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from policies.envs.flat import MAX_SIZE, FlatBox, leaves
 from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices, is_made, made_of
+from policies.envs.stacked import StackedBox
 from policies.errors import MALFORMED, CheckpointError, shortened
 
 _FLAT = "made_of"
 """In the description of the vectors that observations are made, the space of the observations themselves."""
 _OWN = "sent_as"
 """In the description of actions as policies give them, the space of the environment's own."""
+_FRAMES = "frames"
+"""In the description of the vectors of several observations at once, their number."""
 _MASK = "mask"
 _LISTS_FROM = "lists_from"
 """In the description of vectors that begin with a mask, how many values each choice has, and the mask's member."""
@@ -43,15 +46,25 @@ def describe_space(space: gym.Space[Any]) -> dict[str, Any]:
     """
     if isinstance(space, MaskedBox):
         own = {} if space.original is None else {_FLAT: _describe_any(space.original)}
+        own |= _describe_frames(space.seen)
         lists = {} if space.lists_from is None else {_LISTS_FROM: space.lists_from}
         return {**_describe_box(space), **own, _MASK: {"sizes": list(space.sizes), "key": space.key, **lists}}
     if isinstance(space, FlatBox):
         return {**_describe_box(space), _FLAT: _describe_any(space.original)}
+    if isinstance(space, StackedBox):
+        return {**_describe_box(space), **_describe_frames(space)}
     if is_made(space):
         return {**_describe_any(space), _OWN: _describe_any(space.original)}
     if isinstance(space, gym.spaces.Box | gym.spaces.Discrete):
         return _describe_any(space)
     raise _cannot_describe(space)
+
+
+def _describe_frames(space: gym.Space[Any]) -> dict[str, Any]:
+    """Return what describes several observations at once, beside their vectors; empty for what is none."""
+    if not isinstance(space, StackedBox):
+        return {}
+    return {_FLAT: _describe_any(space.frame.original), _FRAMES: space.num_frames}
 
 
 def _describe_any(space: gym.Space[Any]) -> dict[str, Any]:
@@ -99,7 +112,7 @@ def space_from_description(description: Mapping[str, Any]) -> PolicyActions:
         if (mask := description.get(_MASK)) is not None:
             made = _masked(description, mask)
         elif (original := description.get(_FLAT)) is not None:
-            made = FlatBox(_any_from_description(original))
+            made = _flat(original, description.get(_FRAMES))
         elif (original := description.get(_OWN)) is not None:
             made = made_of(_any_from_description(original))
         if made is not None:
@@ -122,13 +135,30 @@ def _masked(description: Mapping[str, Any], mask: Mapping[str, Any]) -> MaskedBo
         raise ValueError(f"a mask {mask}")
     if lists_from is not None and (type(lists_from) is not int or len(sizes) > 1 or key is not None):
         raise ValueError(f"a mask {mask}")
-    if (original := description.get(_FLAT)) is not None:
+    original, num_frames = description.get(_FLAT), description.get(_FRAMES)
+    if original is not None and num_frames is not None:
+        return MaskedBox(_flat(original, num_frames), sizes, lists_from=lists_from)
+    if original is not None:
         return MaskedBox.of(_any_from_description(original), sizes, key, lists_from)
     whole = _any_from_description(description)
     assert isinstance(whole, gym.spaces.Box)
     behind = slice(sum(sizes), None)
     seen = gym.spaces.Box(whole.low[behind], whole.high[behind], dtype=np.float32)
     return MaskedBox(seen, sizes, lists_from=lists_from)
+
+
+def _flat(original: Mapping[str, Any], num_frames: int | None) -> FlatBox | StackedBox:
+    """Return the vectors that observations of a described space are made, or those of several at once.
+
+    Raises:
+        ValueError: There are none, or too many.
+    """
+    frame = FlatBox(_any_from_description(original))
+    if num_frames is None:
+        return frame
+    if type(num_frames) is not int or not 1 < num_frames <= MAX_SIZE // math.prod(frame.shape):
+        raise ValueError(f"{num_frames!r} observations of shape {frame.shape} at once")
+    return StackedBox(frame, num_frames)
 
 
 def _check_same(made: gym.Space[Any], description: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -20,8 +20,10 @@ from policies.envs.flat import FlatBox
 from policies.envs.images import Channels, SeenImage, image_members, image_seen
 from policies.envs.make import EnvInfo, check_env, make_env, make_vector_env
 from policies.envs.masks import MaskedBox, seen_by_networks
+from policies.envs.spaces import describe_space, space_from_description
 from policies.envs.stacked import StackedBox
-from policies.errors import EnvError
+from policies.errors import CheckpointError, EnvError
+from policies.guard import guarded
 from policies.hyperparams import PPOHyperparams
 from policies.portable.file import save_policy
 from tune_jobs.plan.env_checks import check_env_rules
@@ -113,6 +115,28 @@ def test_several_images_of_several_observations_are_one() -> None:
     assert (seen.shape, seen.num_beside) == ((12, 9, 6), 16)
     assert [part.num_channels for part in seen.parts] == [2, 1, 2, 1]
     assert [part.scale for part in seen.parts] == [1 / 255, 1.0, 1 / 255, 1.0]
+
+
+@pytest.mark.parametrize("env_id", [ENV, MASKED, PAIR, "FrozenLake-v1"])
+def test_the_plan_has_the_space_from_a_process_of_the_environments(env_id: str) -> None:
+    """As JSON: with the members of each observation, of which a plan says what convolutions see."""
+    own = check_env(env_id, ARGS)
+    told = guarded.check_env(env_id, ARGS)
+    seen = seen_by_networks(told.observation_space)
+    assert isinstance(seen, StackedBox)
+    assert [place[0::2] for place in seen.places()] == [
+        place[0::2] for place in cast("StackedBox", seen_by_networks(own.observation_space)).places()
+    ]
+    assert (told.image, told.observation_space) == (own.image, own.observation_space)
+    assert isinstance(told.observation_space, MaskedBox) is (env_id == MASKED)
+
+
+@pytest.mark.parametrize("wrong", [1, 0, 4, 10**7, True, "3"])
+def test_a_description_of_other_observations_at_once_is_refused(wrong: Any) -> None:
+    described = describe_space(check_env(ENV, ARGS).observation_space)
+    assert space_from_description(described) == check_env(ENV, ARGS).observation_space
+    with pytest.raises(CheckpointError, match="A space is described as"):
+        space_from_description({**described, "frames": wrong})
 
 
 # -- what is said
