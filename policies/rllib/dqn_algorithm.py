@@ -8,13 +8,26 @@ checkpoints and results stay RLlib's.
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.dqn import DQN, DQNConfig
 from ray.rllib.core import DEFAULT_MODULE_ID
-from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, LEARNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME
+from ray.rllib.utils.metrics import (
+    ENV_RUNNER_RESULTS,
+    EPISODE_LEN_MAX,
+    EPISODE_LEN_MEAN,
+    EPISODE_LEN_MIN,
+    EPISODE_RETURN_MAX,
+    EPISODE_RETURN_MEAN,
+    EPISODE_RETURN_MIN,
+    LEARNER_RESULTS,
+    NUM_ENV_STEPS_SAMPLED_LIFETIME,
+    NUM_EPISODES_LIFETIME,
+)
 from torch import Tensor
 from typing_extensions import override
 
@@ -61,6 +74,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         self._due = 0.0
         self._copies: tuple[list[Tensor], list[Tensor]] | None = None
         self._new_observations: list[NDArray[Any]] = []
+        self._last_episodes: deque[tuple[float, int]] = deque(maxlen=self.config.metrics_num_episodes_for_smoothing)
         self.seed_replay(self.config.seed or 0)
 
     def _create_local_replay_buffer_if_necessary(self, _config: Any) -> None:
@@ -85,7 +99,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
     def training_step(self) -> None:
         """Make one iteration: at least `env_steps_per_iteration` env steps, and the updates that are due for them."""
         hyperparams = self.hyperparams
-        start = self.num_env_steps
+        start, num_episodes = self.num_env_steps, self.num_episodes
         stats: dict[str, float] = {}
         while self.num_env_steps - start < hyperparams.env_steps_per_iteration:
             num_new_steps = self._sample()
@@ -108,10 +122,22 @@ class ReplayDQN(DQN):  # type: ignore[misc]
                 )
             if self._learn_statistics() or num_updates:
                 self._send_weights()
-        num_steps = self.num_env_steps - start
-        self.metrics.log_value((ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME), num_steps, reduce="lifetime_sum")
+        self._log_episodes(self.num_env_steps - start, self.num_episodes - num_episodes)
         if stats:
             self.metrics.log_dict(stats, key=(LEARNER_RESULTS, DEFAULT_MODULE_ID), window=1)
+
+    def _log_episodes(self, num_steps: int, num_episodes: int) -> None:
+        """Log what env runners of RLlib's own log of episodes, once an iteration: each value takes some 20 us."""
+        for name, number in ((NUM_ENV_STEPS_SAMPLED_LIFETIME, num_steps), (NUM_EPISODES_LIFETIME, num_episodes)):
+            self.metrics.log_value((ENV_RUNNER_RESULTS, name), number, reduce="lifetime_sum")
+        if not self._last_episodes:
+            return
+        returns, lengths = np.array(self._last_episodes).T
+        found = {
+            EPISODE_RETURN_MEAN: returns.mean(), EPISODE_RETURN_MIN: returns.min(), EPISODE_RETURN_MAX: returns.max(),
+            EPISODE_LEN_MEAN: lengths.mean(), EPISODE_LEN_MIN: lengths.min(), EPISODE_LEN_MAX: lengths.max(),
+        }  # fmt: skip
+        self.metrics.log_dict({name: float(value) for name, value in found.items()}, key=ENV_RUNNER_RESULTS, window=1)
 
     def refill(self, num_env_steps: int) -> None:
         """Sample env steps into the replay memory without learning; they count as env steps."""
@@ -143,6 +169,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
             self.replay.add(sample.transitions)
             self.num_env_steps += sample.num_env_steps
             self.num_episodes += sample.num_episodes
+            self._last_episodes.extend(sample.episodes)
             self._new_observations.append(sample.observations)
         return self.num_env_steps - steps
 

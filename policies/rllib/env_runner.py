@@ -48,8 +48,13 @@ class Sample:
     observations: NDArray[Any]
     """The observations that were acted on, shape (B, ...); transitions of several steps are complete only later."""
     num_env_steps: int
-    num_episodes: int
-    """The number of episodes that ended."""
+    episodes: tuple[tuple[float, int], ...]
+    """(undiscounted return, env steps) of each episode that ended."""
+
+    @property
+    def num_episodes(self) -> int:
+        """The number of episodes that ended."""
+        return len(self.episodes)
 
 
 def _checked(env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> gym.vector.VectorEnv[Any, Any, Any]:
@@ -192,7 +197,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
             transitions=transitions,
             observations=transitions.obs if is_whole else fragment["obs"][:-1][fragment["stepped"]],
             num_env_steps=int(fragment["stepped"].sum()),
-            num_episodes=len(self.finished_episodes) - before,
+            episodes=tuple(self.finished_episodes[before:]),
         )
 
     def _follow_episodes(self, fragment: dict[str, NDArray[Any]]) -> None:

@@ -88,3 +88,36 @@ def test_a_loss_that_is_no_number_is_not_hidden() -> None:
     weights = algo.learner.module[MODULE].encoder.state_dict()
     assert not all(torch.isfinite(weight).all() for weight in weights.values())
     algo.stop()
+
+
+@pytest.mark.parametrize("num_env_runners", [0, 2])
+def test_results_tell_of_the_last_episodes_as_rllibs_do(num_env_runners: int) -> None:
+    """For whoever goes on with a restored algorithm; the returns are those of the episodes that a trial counts."""
+    from policies.rllib.config import build_algorithm_config
+
+    hyperparams = DQNHyperparams(hidden_sizes=(8,), env_steps_per_iteration=300, num_envs=2)
+    config = build_algorithm_config(hyperparams, env_id="CartPole-v1", seed=3, num_env_runners=num_env_runners)
+    algo = config.reporting(metrics_num_episodes_for_smoothing=20).build_algo()
+
+    def drawn(runner: Any) -> list[tuple[float, int]]:
+        return list(runner.pop_finished_episodes())
+
+    for expected_iterations in (1, 2):
+        result = algo.train()["env_runners"]
+        if num_env_runners:
+            parts = algo.env_runner_group.foreach_env_runner(drawn, local_env_runner=False)
+        else:
+            parts = [drawn(algo.env_runner)]
+        assert sum(map(len, parts)) > 0
+        recent = list(algo._last_episodes)
+        # The newest are those of this iteration; by runner, as they come.
+        assert {episode for part in parts for episode in part} >= set(recent[-5:])
+        returns, lengths = zip(*recent, strict=True)
+        assert len(recent) <= 20
+        assert result["episode_return_mean"] == pytest.approx(sum(returns) / len(returns))
+        assert (result["episode_return_min"], result["episode_return_max"]) == (min(returns), max(returns))
+        assert result["episode_len_mean"] == pytest.approx(sum(lengths) / len(lengths))
+        assert (result["episode_len_min"], result["episode_len_max"]) == (min(lengths), max(lengths))
+        assert result["num_episodes_lifetime"] == algo.num_episodes
+        assert result["num_env_steps_sampled_lifetime"] == algo.num_env_steps >= 300 * expected_iterations
+    algo.stop()
