@@ -55,12 +55,13 @@ def stable_baselines3_program(
 
     Args:
         values: The setting, all hyperparameters of it.
-        env_id: A registered Gymnasium id.
+        env_id: A registered Gymnasium id, or `module:Class`, which is registered first.
         env_args: Keyword arguments of the environment.
         num_env_steps: Env steps to train.
         flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
     """
     is_ppo = isinstance(values, PPOHyperparams)
+    env_id, imports_of_class, registration = _registered(env_id)
     arguments, notes = _sb3_ppo(values) if isinstance(values, PPOHyperparams) else _sb3_dqn(values, num_env_steps)
     learning_rate: Any = values.lr
     if values.lr_final is not None and values.lr_decay_steps is not None:
@@ -104,7 +105,7 @@ def stable_baselines3_program(
     }
     policy = "MlpPolicy" if values.conv_filters is None else "CnnPolicy"
     lines += [_call(f"model = {name}", [repr(policy), "env"], call), f"model.learn(total_timesteps={num_env_steps})"]
-    return ForeignProgram("\n".join([*imports, "", *lines]), tuple(notes))
+    return ForeignProgram("\n".join([*imports_of_class, *imports, "", *registration, *lines]), tuple(notes))
 
 
 def rllib_program(
@@ -114,10 +115,11 @@ def rllib_program(
 
     Args:
         values: The setting, all hyperparameters of it.
-        env_id: A registered Gymnasium id.
+        env_id: A registered Gymnasium id, or `module:Class`, which is registered first.
         env_args: Keyword arguments of the environment.
         flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
     """
+    env_id, imports, registration = _registered(env_id)
     arguments, notes = _rllib_ppo(values) if isinstance(values, PPOHyperparams) else _rllib_dqn(values)
     name = "PPO" if isinstance(values, PPOHyperparams) else "DQN"
     activation = "GELU" if values.activation == "gelu" else values.activation
@@ -145,15 +147,17 @@ def rllib_program(
     schedule = values.lr if values.lr_final is None else [[0, values.lr], [values.lr_decay_steps, values.lr_final]]
     # RLlib's DQN clips at 40 if it isn't told.
     training = {"lr": schedule, "gamma": values.gamma, "grad_clip": values.grad_clip, **arguments}
-    imports, registered = "", ""
     if flattens and values.conv_filters is None:
         # RLlib has no argument for an env's wrapper, and its layers take no whole numbers.
-        imports = (
-            "import gymnasium\nimport numpy\nfrom gymnasium.wrappers import DtypeObservation, FlattenObservation\n"
-            "from ray.tune import register_env\n"
-        )
+        imports = [
+            *(imports or ["import gymnasium"]),
+            "import numpy",
+            "from gymnasium.wrappers import DtypeObservation, FlattenObservation",
+            "from ray.tune import register_env",
+        ]
         made = f"DtypeObservation(FlattenObservation(gymnasium.make({env_id!r}, **config)), numpy.float32)"
-        registered, env_id = f'register_env("flattened", lambda config: {made})\n\n', "flattened"
+        registration += [f'register_env("flattened", lambda config: {made})', ""]
+        env_id = "flattened"
     elif flattens:
         notes.append(_NO_IMAGES)
     chain = [
@@ -164,11 +168,12 @@ def rllib_program(
         f".rl_module(model_config={_call('DefaultModelConfig', [], model)})",
     ]
     body = "\n".join(f"    {line}" for part in chain for line in part.splitlines())
-    code = (
-        f"{imports}from ray.rllib.algorithms.{name.lower()} import {name}Config\n"
-        "from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig\n\n"
-        f"{registered}config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
-    )
+    imports += [
+        f"from ray.rllib.algorithms.{name.lower()} import {name}Config",
+        "from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig",
+    ]
+    made = f"config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
+    code = "\n".join([*imports, "", *registration, made])
     return ForeignProgram(code, tuple(notes))
 
 
@@ -338,6 +343,19 @@ def _lacking_in_both(values: DQNHyperparams) -> dict[str, bool]:
 def _dqn_notes(library: str, lacks: Mapping[str, bool]) -> list[str]:
     lacking = [name for name, is_wanted in lacks.items() if is_wanted]
     return [f"{library}'s DQN lacks {', '.join(lacking)}."] if lacking else []
+
+
+def _registered(env_id: str) -> tuple[str, list[str], list[str]]:
+    """Return the id by which Gymnasium knows an environment, with the imports and the lines that register it.
+
+    It knows none of a class that is written `module:Class`, as no version is in its name; all others need no lines.
+    """
+    module, colon, name = env_id.partition(":")
+    if not colon or not name.isidentifier():
+        return env_id, [], []
+    own = f"{name}-v0"
+    call = f"gymnasium.register({own!r}, lambda **args: {module}.{name}(**args))"
+    return own, ["import gymnasium", f"import {module}"], [call, ""]
 
 
 def _env_kwargs(name: str, env_args: Mapping[str, Any]) -> str:

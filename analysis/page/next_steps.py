@@ -140,7 +140,7 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     changed = [
         name for name in names if env.get(name) not in (None, 1, False) and not (is_masked and name == "action_mask")
     ]
-    note = f" The env's {', '.join(changed)} are left out." if changed else ""
+    note = f" The env's {', '.join(changed)} {'is' if len(changed) == 1 else 'are'} left out." if changed else ""
     if is_masked:
         note += (
             " The env's mask of actions is left out: what it does not allow is tried there, unless a class that knows "

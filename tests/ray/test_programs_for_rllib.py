@@ -1,5 +1,6 @@
 """The written programs for RLlib configure it as ours trains."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -101,3 +102,23 @@ def test_observations_that_are_no_vectors_are_made_some(values: TrainedHyperpara
         assert algorithm.env_runner.env.single_observation_space.shape == (32 + 11 + 2,)
     finally:
         algorithm.stop()
+
+
+@pytest.mark.parametrize(("name", "flattens"), [("Lake", True), ("Plain", False)])
+def test_it_trains_on_a_class_of_ones_own(
+    name: str, flattens: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_plain.py").write_text(
+        "from gymnasium.envs.classic_control import CartPoleEnv\n"
+        "from gymnasium.envs.toy_text import FrozenLakeEnv\n\n\n"
+        "class Plain(CartPoleEnv):\n    pass\n\n\n"
+        "class Lake(FrozenLakeEnv):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    values = PPOHyperparams(num_envs=2, train_batch_size=64, minibatch_size=32, hidden_sizes=(8,))
+    env_args: dict[str, Any] = {"is_slippery": False, "max_episode_steps": 20} if flattens else {}
+    names: dict[str, Any] = {}
+    exec(rllib_program(values, env_id=f"own_plain:{name}", env_args=env_args, flattens=flattens).code, names)
+    assert names["algorithm"].train()["num_env_steps_sampled_lifetime"] >= 64
+    names["algorithm"].stop()
+    del gym.registry[f"{name}-v0"]

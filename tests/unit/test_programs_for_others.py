@@ -19,6 +19,33 @@ from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperpar
 from policies.networks.epsilon import EpsilonSchedule
 
 SMALL: dict[str, Any] = {"hidden_sizes": (4,), "learning_starts": 0, "train_batch_size": 1}
+OWN = """
+import gymnasium
+from gymnasium.spaces import Box, Dict, Discrete
+
+
+class Corridor(gymnasium.Env):
+    observation_space, action_space = Box(0, 9, (1,)), Discrete(2)
+
+    def __init__(self, length):
+        self.length = length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0
+        return self.seen(), {}
+
+    def step(self, action):
+        self.place += 1
+        return self.seen(), 1.0, self.place >= self.length, False, {}
+
+    def seen(self):
+        return self.observation_space.sample()
+
+
+class Members(Corridor):
+    observation_space = Dict(place=Discrete(10), light=Box(0, 1, (2,)))
+"""
 LATE = {"epsilon_start": 100, "epsilon_decay": 200.0}
 
 
@@ -238,6 +265,36 @@ def test_sb3_trains_on_observations_that_are_no_vectors(env_id: str, values: Tra
     exec(program.code, names)
     assert names["model"].num_timesteps >= 64
     assert names["model"].observation_space == flatten_space(gym.make(env_id).observation_space)
+
+
+@pytest.mark.parametrize(
+    "values", [PPOHyperparams(num_envs=2, train_batch_size=32, minibatch_size=16), DQNHyperparams(**SMALL)], ids=type
+)
+@pytest.mark.parametrize(("name", "flattens"), [("Corridor", False), ("Members", True)])
+def test_sb3_trains_on_a_class_of_ones_own(
+    name: str, flattens: bool, values: TrainedHyperparams, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("stable_baselines3")
+    (tmp_path / "own_corridor.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names: dict[str, Any] = {}
+    program = stable_baselines3_program(
+        values, env_id=f"own_corridor:{name}", env_args={"length": 5}, num_env_steps=64, flattens=flattens
+    )
+    exec(program.code, names)
+    assert names["model"].num_timesteps >= 64
+    assert names["env"].get_attr("unwrapped")[0].length == 5
+    del gym.registry[f"{name}-v0"]
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "my_envs:Maze-v0", "my_envs:deep/Maze-v3"])
+def test_what_gymnasium_knows_needs_no_registration(env_id: str) -> None:
+    for code in (
+        stable_baselines3_program(PPOHyperparams(), env_id=env_id, env_args={}, num_env_steps=64).code,
+        rllib_program(PPOHyperparams(), env_id=env_id, env_args={}).code,
+    ):
+        assert f"({env_id!r}" in code
+        assert "register" not in code
 
 
 def test_images_that_have_to_be_made_first_are_told() -> None:
