@@ -108,7 +108,7 @@ class Policy(ABC):
             batch = np.asarray(observations, dtype=np.float32)
         except (TypeError, ValueError) as error:
             hint = self._what_to_pass()
-            if isinstance(space, MaskedBox):
+            if isinstance(space, MaskedBox) and not wrapped_by(self.env_args):
                 hint += argument_hint(space, self.env_args.get(ACTION_MASK))
             raise ObservationError(
                 f"Observations of {self.env_id} must be {self._wanted()}: {error}.", f"{hint}."

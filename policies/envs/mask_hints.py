@@ -55,8 +55,6 @@ def argument_hint(space: MaskedBox, setting: Setting) -> str:
     """
     if space.key is not None:
         return ""
-    if space.original is None:
-        return ", and the newest mask of the environment as mask="
     name, method = names_in(setting)
     called = f'mask=env.get_wrapper_attr("{method}")()'
     # Without a setting, a mask that is no member is a method.

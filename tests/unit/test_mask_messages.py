@@ -136,7 +136,11 @@ METHOD = 'mask=env.get_wrapper_attr("{}")()'
             {"action_mask": True},
             f', and mask=info["action_mask"], or {METHOD.format("action_masks")} if it is a method.',
         ),
-        ({"frame_stack": 2}, ", and the newest mask of the environment as mask=."),
+        # Its observations begin with the newest mask.
+        (
+            {"frame_stack": 2},
+            ", of an env with frame_stack: 2, with which it was trained: env = policy.make_env().",
+        ),
     ],
     ids=str,
 )
@@ -150,6 +154,9 @@ def test_a_policy_without_a_mask_says_where_it_is(args: dict[str, Any], given: s
             assert caught.value.hint == f"Pass what env.reset or env.step returned{given}"
         if "frame_stack" not in args:
             assert policy.act(own, mask=[0, 1, 0]) == 1
+        else:
+            env = policy.make_env()
+            assert policy.act(env.reset(seed=0)[0]) in range(3)
 
 
 @pytest.mark.parametrize("num", [1, 2, 3])
