@@ -150,13 +150,24 @@ def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRec
         "random": random,
         "optimism_gap": best.optimism_gap,
         "evaluate_command": f"tune-jobs evaluate {shlex.quote(policy)}",
-        "load_code": "from tune_jobs import load_policy\n\n"
-        f"policy = load_policy({policy!r})\n{acting_code(Path(place, 'best'))}",
+        "load_code": loading_code(policy, Path(place, "best")),
         "stale": not is_current(best, trials),
         "chosen_from": "" if choice is None else chosen_from(choice),
         "candidates": candidate_table(best),
         "choice_note": "" if choice is None else choice.note,
     }
+
+
+def loading_code(policy: str, folder: Path) -> str:
+    """Return how a policy is loaded and acts, as Python.
+
+    Args:
+        policy: How it is named.
+        folder: Where it lies.
+    """
+    acting = acting_code(folder)
+    names = "allow_modules, load_policy" if acting.startswith("allow_modules(") else "load_policy"
+    return f"from tune_jobs import {names}\n\npolicy = load_policy({policy!r})\n{acting}"
 
 
 def acting_code(folder: Path) -> str:
@@ -171,8 +182,10 @@ def acting_code(folder: Path) -> str:
         # It is in an object store, or not written yet.
         return "action = policy.act(observation)"
     if wrapped := wrapped_by(policy.env_args):
+        module, colon, _ = policy.env_id.partition(":")
+        allows = f"allow_modules([{module!r}])\n" if colon else ""
         return (
-            f"env = policy.make_env()  # with {wrapped}\nobservation, info = env.reset()\n"
+            f"{allows}env = policy.make_env()  # with {wrapped}\nobservation, info = env.reset()\n"
             "action = policy.act(observation)"
         )
     if not policy.needs_mask:

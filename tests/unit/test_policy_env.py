@@ -11,7 +11,7 @@ import pytest
 from atari_games import ID, NO_OPENCV, needs_opencv, register
 from policy_factory import registered, untrained_policy
 
-from analysis.page.cards import acting_code
+from analysis.page.cards import acting_code, loading_code
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.load import load_policy
 from policies.acting.policy import RandomPolicy
@@ -166,6 +166,23 @@ def test_a_module_that_is_not_allowed_says_how_python_allows_it(tmp_path: Path) 
     with pytest.raises(EnvError, match="'my_own_envs' is not allowed") as caught:
         policy.make_env()
     assert "in Python with tune_jobs.allow_modules(['my_own_envs'])" in caught.value.hint
+
+
+def test_the_reports_code_allows_the_envs_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_pairs.py").write_text("from tune_jobs_test_members import Pair as Pair\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("TUNE_JOBS_ALLOWED_MODULES", "own_pairs")
+    saved("own_pairs:Pair", {"frame_stack": 2}, tmp_path)
+    monkeypatch.delenv("TUNE_JOBS_ALLOWED_MODULES")
+    code = loading_code(str(tmp_path), tmp_path)
+    assert code.startswith("from tune_jobs import allow_modules, load_policy\n")
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert names["action"] in (0, 1)
+    saved("CartPole-v1", {"frame_stack": 2}, tmp_path)
+    assert loading_code("it", tmp_path).startswith(
+        "from tune_jobs import load_policy\n\npolicy = load_policy('it')\nenv ="
+    )
 
 
 def test_masks_come_with_what_it_observes(tmp_path: Path) -> None:
