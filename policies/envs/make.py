@@ -103,7 +103,7 @@ class EnvInfo:
 
     @cached_property
     def image(self) -> SeenImage | None:
-        """The image that convolutions can see, as a whole or among other members; None: there is none, or several."""
+        """The image that convolutions can see, as a whole or among other members; None: there is none."""
         return image_seen(self.observation_space)
 
 

@@ -248,14 +248,17 @@ def _stacked_space(env_id: str, space: gym.Space[Any], num_frames: int) -> gym.s
             "observations: images with a mask cannot be stacked.",
             f"Let a wrapper of your own stack them below the mask, or set {ACTION_MASK}: false.",
         )
-    dtype: Any = space.dtype
+    stacked = _stacked_box(seen, num_frames, space.dtype)
+    return MaskedBox(stacked, space.sizes, lists_from=space.lists_from) if isinstance(space, MaskedBox) else stacked
+
+
+def _stacked_box(seen: gym.spaces.Box, num_frames: int, dtype: Any) -> gym.spaces.Box:
+    if isinstance(seen, FlatBox) and len(seen.shape) == 1:
+        return StackedBox(seen, num_frames)
     # Bounds beyond what 32 bits hold, which vectors behind a mask are of, are infinite there.
     with np.errstate(over="ignore"):
         low, high = (np.concatenate([bound] * num_frames, axis=-1).astype(dtype) for bound in (seen.low, seen.high))
-    stacked = gym.spaces.Box(low, high, dtype=dtype.type)
-    if isinstance(seen, FlatBox) and len(seen.shape) == 1:
-        stacked = StackedBox(seen, num_frames)
-    return MaskedBox(stacked, space.sizes, lists_from=space.lists_from) if isinstance(space, MaskedBox) else stacked
+    return gym.spaces.Box(low, high, dtype=dtype.type)
 
 
 class StackFrames(gym.Wrapper[Any, Any, Any, Any]):

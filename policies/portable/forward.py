@@ -66,7 +66,8 @@ class ForwardPass:
         image = self._image
         images = x
         if image is not None:
-            images = np.concatenate(image.members_of(x), axis=-1)
+            members = image.members_of(x)
+            images = members[0] if len(members) == 1 else np.concatenate(members, axis=-1)
         for conv in self._conv:
             images = conv(images)
         images = images.transpose(0, 3, 1, 2)  # channels first, as torch flattens images

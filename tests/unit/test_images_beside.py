@@ -14,6 +14,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from policy_factory import untrained_policy
+from seen_images import FILTERS, SMALL, assert_all_compute_the_same
 
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.load import load_policy
@@ -24,12 +25,6 @@ from policies.envs.masks import FORBIDDEN, MaskedBox
 from policies.envs.space_hints import one_image_hint
 from policies.errors import CheckpointError, SpecError
 from policies.hyperparams import DQNHyperparams, PPOHyperparams
-from policies.networks.parts import DQNNetworks, PPONetworks, model_config
-from policies.packed.acting import ActingNetworks, ActingOnDevice
-from policies.packed.initial import new_member
-from policies.packed.inputs import Inputs
-from policies.packed.networks import with_ones
-from policies.packed.rows import StackedRows
 from policies.portable.file import save_policy
 from tests.narrowing import present
 from tune_jobs.plan.env_checks import check_env_rules
@@ -44,8 +39,6 @@ pytestmark = pytest.mark.usefixtures("env_plugin")
 ENV, FINE, MASKED = "TestBeside-v0", "TestFineBeside-v0", "TestMaskedBeside-v0"
 SHAPE, SIZE = (12, 9, 2), 12 * 9 * 2
 NUM_SEEN = 3 + SIZE + 2
-FILTERS = ((5, 4, 2), (3, 2, 1))
-SMALL: dict[str, Any] = {"conv_filters": FILTERS, "hidden_sizes": (7,), "activation": "tanh"}
 PIXELS, GREY = spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Box(0, 7, (4, 5), np.uint8)
 GRID, FEW = spaces.Box(-1, 1, (2, 3, 1), np.float32), spaces.Box(-1, 1, (2,), np.float32)
 
@@ -128,45 +121,14 @@ def info_of(env_id: str = ENV) -> EnvInfo:
 @pytest.mark.parametrize("normalizes", [False, True])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_all_compute_the_same_of_what_is_observed(algorithm: str, normalizes: bool, tmp_path: Path) -> None:
-    """torch's networks, a pack's in each of its ways, and the portable policy; by hand from torch's own functions."""
-    make: Any = PPOHyperparams if algorithm == "ppo" else DQNHyperparams
-    hyperparams = make(**SMALL, normalize_observations=normalizes, **({} if algorithm == "ppo" else {"dueling": False}))
-    info, rows = info_of(), observations(20)
-    member = new_member("t0000", hyperparams, 3, info.observation_space, info.action_space)
-    build: Any = PPONetworks if algorithm == "ppo" else DQNNetworks
-    networks = build(info.observation_space, info.action_space, model_config(hyperparams))
-    weights = {name: torch.from_numpy(value) for name, value in member.weights.items()}
-    networks.load_state_dict({name: weights[name] for name in networks.state_dict()})
-    encoder = networks.encoder if algorithm == "dqn" else networks.encoder["actor_encoder"]
-    head = networks.af if algorithm == "dqn" else networks.pi
-    with torch.no_grad():
-        seen = torch.from_numpy(rows)
-        image = seen[:, 3 : 3 + SIZE].reshape(-1, *SHAPE).permute(0, 3, 1, 2)
-        x = image if normalizes else image / 255
-        for layer, stride in zip((0, 2), (2, 1), strict=True):
-            name = f"{'encoder.' if algorithm == 'ppo' else ''}{'actor_' if algorithm == 'ppo' else ''}encoder.conv"
-            of_layer = weights[f"{name}.{layer}.weight"], weights[f"{name}.{layer}.bias"]
-            x = torch.tanh(torch.nn.functional.conv2d(x, *of_layer, stride=stride))
-        x = torch.cat([x.flatten(1), seen[:, :3], seen[:, 3 + SIZE :]], dim=1)
-        expected = head(torch.tanh(torch.nn.functional.linear(x, encoder.mlp[0].weight, encoder.mlp[0].bias))).numpy()
-        found = head(encoder(seen)).numpy()
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-    assert np.abs(expected).max() > 1e-3
-    inputs = Inputs.of(info.observation_space)
-    stacked = StackedRows([member], inputs.shape, 2, "cpu", image=inputs.image)
-    assert stacked.networks.sizes == (4 * 2 * 3 + 5, 7, 2)
-    for acting in (ActingNetworks(stacked.networks, 1), ActingOnDevice(stacked.networks, 1)):
-        np.testing.assert_allclose(acting(rows[None])[0], expected, atol=1e-5)
-    number = stacked.networks.num_networks
-    batch = torch.from_numpy(with_ones(rows[None])).repeat(number, 1, 1)
-    np.testing.assert_allclose(stacked.networks.forward(batch)[0], expected, atol=1e-5)
-    assert stacked.networks.multiplications_per_row == products_per_image(present(info.image), hyperparams) + 7 * 2
-    policy = untrained_policy(ENV, {}, hyperparams, tmp_path)
-    if not normalizes:  # which clips what it has normalised at 10, as no network here does
-        np.testing.assert_allclose(policy.outputs(rows), expected, atol=1e-5)
-    assert policy.portable.network.image == SeenImage(SHAPE, 3, 5, 1.0 if normalizes else 1 / 255)
-    # To the bit, it does not depend on what else is in a batch.
-    assert np.array_equal(np.concatenate([policy.outputs(row[None]) for row in rows]), policy.outputs(rows))
+    def parts(seen: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        image = seen[:, 3 : 3 + SIZE].reshape(-1, *SHAPE)
+        return image if normalizes else image / 255, [seen[:, :3], seen[:, 3 + SIZE :]]
+
+    image = SeenImage(SHAPE, 3, 5, 1 / 255)
+    assert_all_compute_the_same(
+        ENV, algorithm, observations(20), parts, image=image, folder=tmp_path, normalizes=normalizes
+    )
 
 
 def test_what_is_beside_the_image_and_each_pixel_matter(tmp_path: Path) -> None:

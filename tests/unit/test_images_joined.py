@@ -14,6 +14,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from policy_factory import untrained_policy
+from seen_images import FILTERS, SMALL, assert_all_compute_the_same
 
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.load import load_policy
@@ -23,18 +24,11 @@ from policies.envs.images import Channels, SeenImage, image_member, image_member
 from policies.envs.make import EnvInfo, check_env
 from policies.envs.space_hints import named_images
 from policies.errors import CheckpointError, SpecError
-from policies.hyperparams import DQNHyperparams, PPOHyperparams
-from policies.networks.parts import DQNNetworks, PPONetworks, model_config
-from policies.packed.acting import ActingNetworks, ActingOnDevice
-from policies.packed.initial import new_member
-from policies.packed.inputs import Inputs
-from policies.packed.networks import with_ones
-from policies.packed.rows import StackedRows
+from policies.hyperparams import PPOHyperparams
 from policies.portable.file import save_policy
 from tests.narrowing import present
 from tune_jobs.plan.env_checks import check_env_rules
 from tune_jobs.plan.env_notes import env_notes
-from tune_jobs.plan.estimates import products_per_image
 from tune_jobs.spec.file import load_spec
 
 pytestmark = pytest.mark.usefixtures("env_plugin")
@@ -43,8 +37,6 @@ ENV = "TestPair-v0"
 SIZE = 12 * 9
 COLOR, DEPTH = slice(2, 2 + 2 * SIZE), slice(5 + 2 * SIZE, 5 + 3 * SIZE)
 NUM_SEEN = 3 * SIZE + 8
-FILTERS = ((5, 4, 2), (3, 2, 1))
-SMALL: dict[str, Any] = {"conv_filters": FILTERS, "hidden_sizes": (7,), "activation": "tanh"}
 SEEN = SeenImage((12, 9, 3), 2, 8, 1 / 255, (Channels(5 + 2 * SIZE, 1),))
 PIXELS, GREY = spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Box(0, 7, (4, 5), np.uint8)
 ASIDE, FEW = spaces.Box(0, 255, (5, 4, 3), np.uint8), spaces.Box(-1, 1, (2,), np.float32)
@@ -100,47 +92,14 @@ def observations(num: int) -> NDArray[np.float32]:
 @pytest.mark.parametrize("normalizes", [False, True])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_all_compute_the_same_of_several(algorithm: str, normalizes: bool, tmp_path: Path) -> None:
-    """torch's networks, a pack's in each of its ways, and the portable policy; by hand from torch's own functions."""
-    make: Any = PPOHyperparams if algorithm == "ppo" else DQNHyperparams
-    hyperparams = make(**SMALL, normalize_observations=normalizes, **({} if algorithm == "ppo" else {"dueling": False}))
-    info, rows = info_of(), observations(20)
-    assert info.image == SEEN
-    member = new_member("t0000", hyperparams, 3, info.observation_space, info.action_space)
-    build: Any = PPONetworks if algorithm == "ppo" else DQNNetworks
-    networks = build(info.observation_space, info.action_space, model_config(hyperparams))
-    weights = {name: torch.from_numpy(value) for name, value in member.weights.items()}
-    networks.load_state_dict({name: weights[name] for name in networks.state_dict()})
-    encoder = networks.encoder if algorithm == "dqn" else networks.encoder["actor_encoder"]
-    head = networks.af if algorithm == "dqn" else networks.pi
-    with torch.no_grad():
-        seen = torch.from_numpy(rows)
+    def parts(seen: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
         color = seen[:, COLOR].reshape(-1, 12, 9, 2) / (1 if normalizes else 255)
-        x = torch.cat([color, seen[:, DEPTH].reshape(-1, 12, 9, 1)], dim=3).permute(0, 3, 1, 2)
-        for layer, stride in zip((0, 2), (2, 1), strict=True):
-            name = f"{'encoder.' if algorithm == 'ppo' else ''}{'actor_' if algorithm == 'ppo' else ''}encoder.conv"
-            of_layer = weights[f"{name}.{layer}.weight"], weights[f"{name}.{layer}.bias"]
-            x = torch.tanh(torch.nn.functional.conv2d(x, *of_layer, stride=stride))
         beside = [seen[:, :2], seen[:, COLOR.stop : DEPTH.start], seen[:, DEPTH.stop :]]
-        x = torch.cat([x.flatten(1), *beside], dim=1)
-        expected = head(torch.tanh(torch.nn.functional.linear(x, encoder.mlp[0].weight, encoder.mlp[0].bias))).numpy()
-        found = head(encoder(seen)).numpy()
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-    assert np.abs(expected).max() > 1e-3
-    inputs = Inputs.of(info.observation_space)
-    stacked = StackedRows([member], inputs.shape, 2, "cpu", image=inputs.image)
-    assert stacked.networks.sizes == (4 * 2 * 3 + 8, 7, 2)
-    for acting in (ActingNetworks(stacked.networks, 1), ActingOnDevice(stacked.networks, 1)):
-        np.testing.assert_allclose(acting(rows[None])[0], expected, atol=1e-5)
-    batch = torch.from_numpy(with_ones(rows[None])).repeat(stacked.networks.num_networks, 1, 1)
-    np.testing.assert_allclose(stacked.networks.forward(batch)[0], expected, atol=1e-5)
-    np.testing.assert_allclose(stacked.networks.evaluate(batch[:1], 0, 1)[0], expected, atol=1e-5)
-    assert stacked.networks.multiplications_per_row == products_per_image(SEEN, hyperparams) + 7 * 2
-    policy = untrained_policy(ENV, {}, hyperparams, tmp_path)
-    if not normalizes:  # which clips what it has normalised at 10, as no network here does
-        np.testing.assert_allclose(policy.outputs(rows), expected, atol=1e-5)
-    assert policy.portable.network.image == (SEEN.unscaled if normalizes else SEEN)
-    # To the bit, it does not depend on what else is in a batch.
-    assert np.array_equal(np.concatenate([policy.outputs(row[None]) for row in rows]), policy.outputs(rows))
+        return torch.cat([color, seen[:, DEPTH].reshape(-1, 12, 9, 1)], dim=3), beside
+
+    assert_all_compute_the_same(
+        ENV, algorithm, observations(20), parts, image=SEEN, folder=tmp_path, normalizes=normalizes
+    )
 
 
 def test_each_image_and_what_is_beside_them_matter(tmp_path: Path) -> None:

@@ -33,14 +33,12 @@ def saved(env_id: str, env_args: dict[str, Any], folder: Path, **values: Any) ->
     return load_policy(folder)
 
 
-def played(policy: Any, seed: int, code: str = "action = policy.act(observation)") -> float:
+def played(policy: Any, seed: int) -> float:
     """The return of an episode as a user plays it."""
     env, total, is_over = policy.make_env(), 0.0, False
     observation, _ = env.reset(seed=seed)
     while not is_over:
-        names = {"policy": policy, "observation": observation}
-        exec(code, names)
-        observation, reward, terminated, truncated, _ = env.step(names["action"])
+        observation, reward, terminated, truncated, _ = env.step(policy.act(observation))
         total, is_over = total + float(reward), terminated or truncated
     env.close()
     return total

@@ -17,6 +17,7 @@ from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import Choices
 from policies.envs.space_hints import channels_last_hint, named_images, one_image_hint
+from policies.envs.stacked import StackedBox
 from policies.envs.wrappers import PIXELS, RESERVED
 from policies.errors import EnvError, SpecError
 from policies.hyperparams import ConstantHyperparams, Hyperparams
@@ -161,10 +162,12 @@ def _without_images(env: EnvInfo, place: str) -> str:
     """Return what to do about convolutions where vectors are observed: several members of them may be images."""
     images = list(image_members(env.observation_space))
     if images:
-        own = getattr(env.observation_space, "original", env.observation_space)
-        names, hint = named_images(images), one_image_hint(env.env_id, own, images)
-        together = "Those of one height and width are seen together, as the channels of one."
-        return f"Leave {place} out, or observe only one of {names}. {together} {hint}"
+        seen = env.observation_space
+        own = seen.frame.original if isinstance(seen, StackedBox) else getattr(seen, "original", seen)
+        hint = "Those of one height and width are seen together, as the channels of one."
+        if own is not None:  # else frames are stacked below a mask, which a wrapper could lose
+            hint += f" {one_image_hint(env.env_id, own, images)}"
+        return f"Leave {place} out, or observe only one of {named_images(images)}. {hint}"
     return f"Leave {place} out, or observe images with env.{PIXELS}: true."
 
 
