@@ -26,6 +26,13 @@ HEAVY = ("ray", "torch", "pandas", "matplotlib", "scipy", "optuna", "imageio", "
 # -- dry runs and bad input, by the real validation
 
 
+def test_a_dry_run_refuses_to_wait_for_nodes_of_no_cluster(run: RunCommand) -> None:
+    for more in ([], ["--dry-run"]):
+        result = run("launch", "cartpole-ppo", "--wait-for-nodes", "60", *more)
+        assert result.exit_code == 2
+        assert "--wait-for-nodes 60 (wait_for_nodes) waits for nodes of a Ray cluster" in result.stderr
+
+
 def test_a_dry_run_prints_the_plan_and_writes_nothing(run: RunCommand, tmp_path: Path) -> None:
     result = run("launch", "cartpole-ppo", "--dry-run", "--set", "resources.max_concurrent=1")
     assert result.exit_code == 0

@@ -163,6 +163,17 @@ def test_report_and_films_are_downloaded(run: RunCommand, site: Live, tmp_path: 
         assert run("--server", site.url, *words.split()).exit_code == code
 
 
+@pytest.mark.parametrize(
+    ("output", "stem"), [("best-lr0.5", "best-lr0.5"), ("a.v1.gif", "a.v1"), ("my/film.MP4", "my/film")]
+)
+def test_a_film_keeps_its_name_behind_a_dot(
+    run: RunCommand, site: Live, tmp_path: Path, output: str, stem: str
+) -> None:
+    printed = json.loads(run("--server", site.url, "video", "mine", "-o", output, "--json").stdout)
+    assert printed == {"mp4": f"{stem}.mp4", "gif": f"{stem}.gif"}
+    assert (tmp_path / f"{stem}.mp4").read_bytes() == FILM
+
+
 def test_films_of_other_names_are_not_downloaded(
     run: RunCommand, site: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

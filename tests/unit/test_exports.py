@@ -232,6 +232,15 @@ def test_several_sweeps_are_for_figures_alone(tmp_path: Path) -> None:
         tune_jobs.export([], "pdf", storage=tmp_path)
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet", "optuna", "sweep"])
+def test_what_has_all_settings_takes_no_number_of_them(tmp_path: Path, kind: Any) -> None:
+    store = make_sweep_folder(tmp_path / "mine")
+    with pytest.raises(SpecError, match=rf"--top 3 \(top\) is of tables in LaTeX and of figures; {kind} has all"):
+        tune_jobs.export(store.folder, kind, output=tmp_path / "out", top=3)
+    assert not list(tmp_path.glob("out*"))
+    assert tune_jobs.export(store.folder, "latex", output=tmp_path / "out", top=1)
+
+
 # -- LaTeX
 
 

@@ -135,6 +135,11 @@ def test_more_seeds_that_are_left_out_as_nothing_is_to_follow_the_trials_are_tol
     assert note.startswith("the 2 leading settings got no more seeds (confirm)")
     assert f"`tune-jobs resume {folder}` does both" in note
     assert len(sweeps.resume(folder, progress="none").trials) == 6
+    several = make_sweep_folder(
+        tmp_path / "several", num_samples=4, seeds_per_point=1, confirm=confirm | {"seeds": 2}
+    ).folder
+    (note,) = sweeps.resume(several, finish=False, progress="none").notes
+    assert note.startswith("the 2 leading settings got no more seeds (confirm)")
     # It has had them.
     assert sweeps.resume(folder, finish=False, progress="none").notes == ()
     assert sweeps.resume(store.folder, finish=False, progress="none").notes == ()

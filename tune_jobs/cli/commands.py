@@ -107,7 +107,8 @@ def launch(
             if server_of() is None:
                 from tune_jobs.sweeps.dry_run import planned
 
-                loaded, plan = planned(spec, overrides, name=name, storage=storage, address=options["address"])
+                where = {name: options[name] for name in ("address", "wait_for_nodes")}
+                loaded, plan = planned(spec, overrides, name=name, storage=storage, **where)
             else:
                 loaded, plan = verbs().planned(spec, overrides, name=name)
         cli_plan.show_plan(loaded, plan, as_json=as_json, finish=options["finish"])

@@ -95,7 +95,10 @@ class RemoteVerbs:
             names = {film: film for film in known}
         else:
             names = {film: film.removeprefix("after_") for film in ("after_mp4", "after_gif") if film in known}
-            wanted = {film: Path(output).with_suffix(f".{suffix}") for film, suffix in names.items()}
+            # Another suffix, such as that of `cartpole-v0.5`, is kept, as it is where the folder is.
+            path = Path(output)
+            stem = path.stem if path.suffix.lower() in (".mp4", ".gif") else path.name
+            wanted = {film: path.with_name(f"{stem}.{suffix}") for film, suffix in names.items()}
         if not wanted:
             raise NotFoundError(
                 f"Sweep {source} has no film of its best policy.", "They are made when the sweep has ended."

@@ -74,6 +74,8 @@ class SweepPlan:
     gpus_per_trial: float
     max_concurrent: int
     """How many trials run at once, including those in packs."""
+    max_concurrent_alone: int
+    """How many of those in processes of their own run at once; packs are done before they begin."""
     evaluation_seeds: tuple[int, ...]
     confirmation_seeds: tuple[int, ...]
     max_env_steps: int
@@ -138,6 +140,8 @@ class SweepPlan:
                 machine=TypeAdapter(Machine).validate_python(data["machine"]),
                 notes=tuple(data["notes"]),
                 packs=None if packs is None else _stored_packs(packs),
+                # A plan of an older service has no such number.
+                max_concurrent_alone=data.get("max_concurrent_alone", data["max_concurrent"]),
                 **{name: data[name] for name in simple},
             )
         except MALFORMED as error:
@@ -202,9 +206,15 @@ def make_plan(
     memory = _largest(sizes, specs, lambda _, each: trial_bytes(env, each))
     members = _members(to_run, points, memory)
     alone = max((memory[trial.point_index] for trial in to_run if not _is_packed(trial)), default=0)
-    concurrent, memory_notes = lowered_by_memory(
-        machine, alone, concurrent, cpus=float(spec.cpus_per_trial), algorithm=spec.algorithm
+    at_once = lowered_by_memory(
+        machine,
+        alone,
+        concurrent,
+        cpus=spec.cpus_per_trial,
+        algorithm=spec.algorithm,
+        by_cpus=spec.scheduler.waits_for_others,
     )
+    concurrent = at_once.number
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
@@ -213,9 +223,10 @@ def make_plan(
     return SweepPlan(
         trials=trials,
         num_points=len(points),
-        cpus_per_trial=spec.cpus_per_trial,
+        cpus_per_trial=at_once.cpus,
         gpus_per_trial=spec.resources.num_gpus,
         max_concurrent=concurrent,
+        max_concurrent_alone=at_once.number,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
         max_env_steps=_total(trials, lengths),
@@ -230,7 +241,7 @@ def make_plan(
             *comparison_notes(spec, ((own, each) for own, values in zip(specs, sizes, strict=True) for each in values)),
             *idle,
             *engine_notes,
-            *memory_notes,
+            *at_once.notes,
             *outside_notes(spec, chosen_points),
             *repeated_notes(chosen_points, searched),
             *prior_notes(spec, prior),

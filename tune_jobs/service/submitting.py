@@ -288,10 +288,9 @@ def _spec_of(submission: Submission) -> SweepSpec:
 def num_cpus_of(plan: SweepPlan) -> float:
     """Return how many CPUs a sweep takes while it runs, at most those of its machine."""
     packs, others, packed = plan.packs, len(plan.trials), 0.0
-    at_once = plan.max_concurrent
     if packs is not None:
         others -= len(packs.trial_ids)
-        at_once -= packs.max_concurrent
         packed = packs.num_packs * packs.cpus_per_pack
-    alone = min(others, max(0, at_once)) * plan.cpus_per_trial
-    return float(min(max(1.0, packed + alone), plan.machine.num_cpus))
+    alone = min(others, plan.max_concurrent_alone) * plan.cpus_per_trial
+    # Packs are done before trials alone begin.
+    return float(min(max(1.0, packed, alone), plan.machine.num_cpus))

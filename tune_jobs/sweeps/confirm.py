@@ -7,7 +7,7 @@ race, and an equal spec and seed give an equal one.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from analysis.objectives import SettingScores, reached_goal
 from analysis.racing import Race, race_within
@@ -44,12 +44,45 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
     threshold = threshold_for(spec)
     with store.reading():
         trials, results = read_trials(store), read_results(store)
-    before = trials_before(trials, rounds)
-    race = confirming_race(spec, different_points(ranked(spec, before, results, threshold)), before)
+
+    def ranked_of(known: Sequence[TrialRecord]) -> list[SettingScores]:
+        return list(ranked(spec, known, results, threshold))
+
+    race, before, num_done = race_under_way(spec, trials, rounds, ranked_of)
     if race is None or are_all_alike([line for trial in before for line in results.get(trial.trial_id, ())]):
         return ()
-    scores = {item.point_index: item.scores for item in ranked(spec, trials, results, threshold)}
-    return race.next_points(scores, len(rounds))
+    return race.next_points(_scores(ranked_of(trials)), num_done)
+
+
+def race_under_way(
+    spec: SweepSpec,
+    trials: Sequence[TrialRecord],
+    rounds: Sequence[ReplicationRecord],
+    ranked_of: Callable[[Sequence[TrialRecord]], Sequence[SettingScores]],
+) -> tuple[Race | None, list[TrialRecord], int]:
+    """Return the race that goes on or begins, the trials that were there before it, and how many rounds are over.
+
+    A trial that failed and was trained again may have come to lead. Rounds in which its setting did not race are
+    another race's, which is given up as when points are added: their seeds count as spent.
+
+    Args:
+        spec: The sweep.
+        trials: All of its trials.
+        rounds: Those since the last points came, oldest first.
+        ranked_of: Ranks settings, by those trials of them that it is given.
+    """
+    for first in range(len(rounds) + 1):
+        own = rounds[first:]
+        before = trials_before(trials, own)
+        settings = ranked_of(before)
+        race = confirming_race(spec, different_points(settings), before)
+        if race is None or not own or set() < set(race.next_points(_scores(settings), 0)) <= set(own[0].points):
+            break
+    return race, before, len(own)
+
+
+def _scores(settings: Sequence[SettingScores]) -> dict[int, Sequence[float]]:
+    return {item.point_index: item.scores for item in settings}
 
 
 def are_all_alike(results: Sequence[IterationRecord]) -> bool:

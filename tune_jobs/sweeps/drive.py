@@ -306,7 +306,7 @@ def _run_trials(
                 shared.connection = stack.enter_context(connected(address, machine, packs=plan.packs is not None))
             from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
-            most = plan.max_concurrent
+            most = plan.max_concurrent_alone
             job = RunJob(
                 store.place,
                 todo,

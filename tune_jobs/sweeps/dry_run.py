@@ -13,6 +13,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.sweeps.drive import connected
 from tune_jobs.sweeps.prior import read_priors
 from tune_jobs.sweeps.storage import choose_store, stem_of, storage_place
+from tune_jobs.sweeps.waiting import check_wait
 
 
 @checked
@@ -23,11 +24,13 @@ def planned(
     name: str | None = None,
     storage: str | Path | None = None,
     address: str | None = None,
+    wait_for_nodes: float = 0.0,
 ) -> tuple[SweepSpec, SweepPlan]:
-    """Return the sweep and the plan that `verbs.launch` would run.
+    """Return the sweep and the plan that `verbs.launch` would run; it waits for no node.
 
     Arguments and errors are those of `verbs.launch`.
     """
+    check_wait(address, wait_for_nodes)
     spec = load_source(source, overrides)
     if name is not None:
         spec = spec.model_copy(update={"name": name})

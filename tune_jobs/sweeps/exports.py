@@ -146,6 +146,11 @@ def export(
             f"{len(names)} sweeps were given; {kind} is of one.",
             f"Export them one by one; several go into one figure ({', '.join(FIGURES)}).",
         )
+    if top is not None and kind not in (*FIGURES, "latex"):
+        raise SpecError(
+            f"--top {top} (top) is of tables in LaTeX and of figures; {kind} has all of a sweep.",
+            f"Leave it out, or name another form: latex, {', '.join(FIGURES)}.",
+        )
     store = find_sweep(names[0], storage)
     suffix = _SUFFIXES.get(kind, f"-{kind}")
     path = Path(f"{store.name}{suffix}") if output is None else expanded(output)

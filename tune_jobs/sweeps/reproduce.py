@@ -196,8 +196,8 @@ def _plan(spec: SweepSpec, trial: TrialRecord, record: SweepRecord, machine: Mac
         )  # fmt: skip
     return SweepPlan(
         trials=(trial,), num_points=1, cpus_per_trial=cpus, gpus_per_trial=gpus, max_concurrent=1,
-        evaluation_seeds=record.evaluation_seeds, confirmation_seeds=record.confirmation_seeds, max_env_steps=0,
-        max_disk_bytes=0, env=env, machine=machine, packs=packs,
+        max_concurrent_alone=1, evaluation_seeds=record.evaluation_seeds, confirmation_seeds=record.confirmation_seeds,
+        max_env_steps=0, max_disk_bytes=0, env=env, machine=machine, packs=packs,
     )  # fmt: skip
 
 

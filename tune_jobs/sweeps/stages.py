@@ -141,7 +141,9 @@ def _what_is_left_out(store: Sweep) -> tuple[str, ...]:
         # Who wants them is told what is wrong.
         return ()
     command = resume_command(store, store.read_record())
-    told = f"the {len(wanted)} leading settings got no more seeds (confirm), as nothing was to follow the trials"
+    settings = len(set(wanted))
+    leading = "the leading setting" if settings == 1 else f"the {settings} leading settings"
+    told = f"{leading} got no more seeds (confirm), as nothing was to follow the trials"
     return (f"{told}: `{command}` does both.",) if wanted else ()
 
 
