@@ -10,6 +10,24 @@ from selenium.webdriver.common.keys import Keys
 
 pytestmark = IN_A_BROWSER
 FAILED = "#/sweeps/cartpole-ppo?trial=t0003"
+LOST = """
+    const ask = window.fetch;
+    Object.assign(window, { keys: [], numPlans: 0 });
+    window.fetch = (url, options) => {
+      const key = options?.headers?.["Idempotency-Key"];
+      if (String(url).endsWith("/plans")) window.numPlans += 1;
+      if (!key) return ask(url, options);
+      window.keys.push(key);
+      return Promise.reject(new TypeError("lost"));
+    };
+    window.type = (text) => {
+      const area = document.querySelector("#sweep-file");
+      area.value += text;
+      area.dispatchEvent(new Event("input", { bubbles: true }));
+    };
+    window.submit = () => document.querySelector("form.submit").requestSubmit();
+"""
+"""A page whose submissions are lost on the way; the keys that they had are kept."""
 
 
 def column(page: Page, heading: str) -> list[str]:
@@ -237,6 +255,23 @@ def test_the_priority_of_what_waits_is_changed(page: Page, live: Live) -> None:
     page.button("Save", "dialog").click()
     page.wait("return document.querySelector('.dialog') === null")
     assert [job.priority for job in live.service.queue.jobs(sweep="waits")] == [7]
+
+
+def test_a_submission_has_another_key_once_the_text_is_another(page: Page) -> None:
+    page.open("#/new")
+    page.says(".plan", "valid")
+    page.run(LOST)
+    # Faster than the text is looked at, which is so a moment after the last key.
+    page.run("window.type('# one'); window.submit();")
+    page.says(".submit .problem", "The service can't be reached.")
+    page.wait("return window.numPlans > 0")
+    page.run("window.submit();")
+    page.wait("return window.keys.length === 2")
+    page.wait("return !document.querySelector('form.submit [type=submit]').disabled")
+    page.run("window.type(' and two'); window.submit();")
+    page.wait("return window.keys.length === 3")
+    first, again, other = page.run("return window.keys")
+    assert first == again != other
 
 
 def test_a_plan_that_had_no_turn_is_asked_for_again(page: Page, live: Live, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from policies.errors import CannotRunError, NotFoundError
+from policies.errors import CannotRunError, NotFoundError, SpecError
 from tune_jobs.client.answers import Job, Planned, Submitted, Summary
 from tune_jobs.client.asking import API, sweep_path
 from tune_jobs.client.downloads import download
 from tune_jobs.client.event_stream import Event, follow
 from tune_jobs.client.looking import Looking
 from tune_jobs.client.problems import LostConnectionError, NoServiceError
-from tune_jobs.client.sources import Source, request_of
+from tune_jobs.client.sources import Source, plain_values, request_of
 
 _PLAN_S = 600.0
 """How long a plan may take: environments are made and stepped for it."""
@@ -90,9 +90,11 @@ class Client(Looking):
                 service has no cluster whose nodes could be waited for.
             CannotRunError: It cannot run there.
         """
-        body = request_of(source, overrides, name) | {"priority": priority, "note": note, "tags": list(tags)}
+        body = request_of(source, overrides, name) | plain_values(priority=priority, note=note, tags=list(tags))
         if wait_for_nodes is not None:
-            body["wait_for_nodes"] = wait_for_nodes
+            body |= plain_values(wait_for_nodes=wait_for_nodes)
+        if key and not (key.isascii() and key.isprintable()):
+            raise SpecError(f"key: {key[:200]!r} has characters that no header of HTTP can hold.", "Use plain letters.")
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
         found = self._ask("POST", "/sweeps", body=body, repeat=True, headers=headers, timeout_s=_PLAN_S)
         return self._read(Submitted, found)
@@ -125,7 +127,7 @@ class Client(Looking):
         Raises:
             SpecError: The space has nothing random to draw, or there would be too many trials.
         """
-        return self._change(name, "extend", wait_for_nodes, {"num_samples": num_samples})
+        return self._change(name, "extend", wait_for_nodes, plain_values(num_samples=num_samples))
 
     def inject(self, name: str, point: Mapping[str, Any], *, wait_for_nodes: float | None = None) -> Job:
         """Have a point of one's own trained, with all seeds of a point.
@@ -138,11 +140,11 @@ class Client(Looking):
         Raises:
             SpecError: A value is missing or wrong, or there would be too many trials.
         """
-        return self._change(name, "trials", wait_for_nodes, {"point": dict(point)})
+        return self._change(name, "trials", wait_for_nodes, plain_values(point=point))
 
     def replicate(self, name: str, *, top: int = 5, seeds: int = 5, wait_for_nodes: float | None = None) -> Job:
         """Have the leading settings trained again with fresh seeds, at most so many each; the wait as for `submit`."""
-        return self._change(name, "replicate", wait_for_nodes, {"top": top, "seeds": seeds})
+        return self._change(name, "replicate", wait_for_nodes, plain_values(top=top, seeds=seeds))
 
     def _change(self, name: str, verb: str, wait_for_nodes: float | None, body: Any = None) -> Job:
         query = {"wait_for_nodes": wait_for_nodes}
@@ -162,7 +164,7 @@ class Client(Looking):
             ConflictError: A priority is given, and no job of the sweep waits.
         """
         given = {"priority": priority, "note": note, "tags": None if tags is None else list(tags)}
-        body = {key: value for key, value in given.items() if value is not None}
+        body = plain_values(**{key: value for key, value in given.items() if value is not None})
         return self._read(Summary, self._ask("PATCH", sweep_path(name), body=body, repeat=True))
 
     def delete(self, name: str, *, force: bool = False) -> None:

@@ -19,15 +19,26 @@ def request_of(source: Source, overrides: Sequence[str], name: str | None) -> di
         name: The sweep's name; None: the file's, else one after the file or preset.
 
     Raises:
-        SpecError: There is no such file or preset, or it can't be read.
+        SpecError: There is no such file or preset, it can't be read, or a value is none that JSON can hold.
     """
     from tune_jobs.spec.file import preset_names, read_sweep_file
     from tune_jobs.spec.plain_data import to_plain
 
-    request: dict[str, Any] = {"overrides": list(overrides), "name": name}
+    request = plain_values(overrides=list(overrides), name=name)
     if isinstance(source, Mapping):
         return request | {"spec": to_plain(source, "sweep")}
     if not Path(source).is_file() and str(source) in preset_names():
         return request | {"preset": str(source)}
     _, text = read_sweep_file(source)
     return request | {"text": text, "default_name": Path(source).stem}
+
+
+def plain_values(**given: Any) -> dict[str, Any]:
+    """Return what a caller gave as JSON holds it, by the names of the arguments; numbers of NumPy are Python's then.
+
+    Raises:
+        SpecError: A value is none that JSON can hold, such as nan; the message says where.
+    """
+    from tune_jobs.spec.plain_data import to_plain
+
+    return {name: to_plain(value, name) for name, value in given.items()}

@@ -38,6 +38,14 @@ def watch_or_end(place: str | Path) -> str:
     return f"Watch it with `tune-jobs status {named}`, or end it with `tune-jobs stop {named}`."
 
 
+def still_driven(name: str) -> tuple[str, str]:
+    """Return what is wrong, and what to do, where a cluster runs a sweep on for a process that has ended."""
+    return (
+        f"A cluster still runs sweep {name}, for a process that has ended.",
+        "Try again in a minute: the cluster is ending the run.",
+    )
+
+
 @contextlib.contextmanager
 def served(storage: str) -> Iterator[None]:
     """Name the sweeps of a storage by their names in the block: who is told how to go on asks the service that has it.

@@ -89,6 +89,26 @@ def refuse_link(path: Path) -> None:
         )
 
 
+def refuse_linked_sweep(folder: Path) -> None:
+    """Check that a sweep folder that is to be removed is none by a symbolic link: its files are elsewhere.
+
+    Raises:
+        CannotRunError: It is a link, or this cannot be found out.
+    """
+    try:
+        target = folder.readlink() if folder.is_symlink() else None
+    except OSError as error:
+        raise CannotRunError(
+            f"{folder} cannot be looked at: {error.strerror or error}.",
+            "Check the permissions of the folders above it.",
+        ) from error
+    if target is not None:
+        raise CannotRunError(
+            f"{folder} is a symbolic link to {target}; a sweep is not removed through a link.",
+            "Remove the link, or the folder that it points to.",
+        )
+
+
 def refuse_links_in(folder: Path) -> Path:
     """Return a folder, which need not exist, if neither it nor anything in it is a symbolic link.
 

@@ -19,7 +19,7 @@ from policies.errors import CannotRunError, CheckpointError, NotFoundError, Spec
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
-from tune_jobs.store.command_names import name_in_commands, watch_or_end
+from tune_jobs.store.command_names import name_in_commands, still_driven, watch_or_end
 from tune_jobs.store.leftovers import remove_abandoned
 from tune_jobs.store.locks import held, is_held
 from tune_jobs.store.ownership import Owner
@@ -30,6 +30,7 @@ from tune_jobs.store.places import (
     not_older,
     parts_of,
     refuse_link,
+    refuse_linked_sweep,
     refuse_links_in,
     remove_file,
     remove_folder,
@@ -109,7 +110,12 @@ class SweepStore:
                 self.folder.mkdir()
             except FileExistsError as error:
                 raise name_taken(self.folder) from error
-            (self.folder / names.TRIALS_FOLDER).mkdir()
+            try:
+                (self.folder / names.TRIALS_FOLDER).mkdir()
+            except OSError:
+                # An empty folder would hold the name for ever.
+                self.discard()
+                raise
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
             raise CannotRunError(
@@ -128,8 +134,9 @@ class SweepStore:
         """Remove the folder.
 
         Raises:
-            CannotRunError: A process drives the sweep, or the folder cannot be removed.
+            CannotRunError: A process drives the sweep, or the folder cannot be removed, such as a symbolic link.
         """
+        refuse_linked_sweep(self.folder)
         try:
             with self.lock():
                 remove_file(self.record_path)
@@ -361,7 +368,7 @@ class SweepStore:
         told = f"Sweep {self.name} is being run by another process."
         with held(self._lock_path, told, watch_or_end(self.place)):
             if is_held(self._driver_lock_path):
-                raise CannotRunError(*self._still_driven)
+                raise CannotRunError(*still_driven(self.name))
             yield
 
     @contextlib.contextmanager
@@ -371,23 +378,15 @@ class SweepStore:
         Raises:
             CannotRunError: Such a process still runs.
         """
-        with held(self._driver_lock_path, *self._still_driven):
+        with held(self._driver_lock_path, *still_driven(self.name)):
             yield
-
-    @property
-    def _still_driven(self) -> tuple[str, str]:
-        return (
-            f"A cluster still runs sweep {self.name}, for a process that has ended.",
-            "Try again in a minute: the cluster is ending the run.",
-        )
 
 
 def name_taken(folder: Path) -> SpecError:
     """Return the error for a new sweep whose folder exists already."""
-    go_on = f"continue it: `tune-jobs resume {name_in_commands(folder)}`"
-    unfinished = f"unless it is being written just now, remove that folder: it has no {names.SWEEP_RECORD}"
-    other = go_on if SweepStore(folder).exists() else unfinished
-    hint = f"Choose another name with --name, or {other}."
+    go_on = f", or continue it: `tune-jobs resume {name_in_commands(folder)}`"
+    unfinished = f"; or, if it isn't being written just now, remove that folder: it has no {names.SWEEP_RECORD}"
+    hint = f"Choose another name with --name{go_on if SweepStore(folder).exists() else unfinished}."
     return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 
 

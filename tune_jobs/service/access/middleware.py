@@ -31,6 +31,11 @@ PUBLIC_PATHS = frozenset({"/", "/healthz", "/readyz", "/api/v1/login"})
 PUBLIC_FOLDERS = ("/static/",)
 """What needs no token: the page's own files, which show nothing until somebody has logged in, and what monitors ask."""
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
+_EVENTS = b"text/event-stream"
+
+
+class CutError(Exception):
+    """An answer ends before it is whole, which the server says by cutting the connection."""
 
 
 class AccessMiddleware:
@@ -50,7 +55,11 @@ class AccessMiddleware:
         self._told = RateLimit(1, 60.0)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one connection, as ASGI has it."""
+        """Handle one connection, as ASGI has it.
+
+        Raises:
+            CutError: The token of a download is no longer valid.
+        """
         if scope["type"] == "http":
             await self._http(_Request(scope), receive, with_security_headers(send, scope["path"]))
         elif scope["type"] == "websocket":
@@ -81,32 +90,49 @@ class AccessMiddleware:
             return
         with anyio.CancelScope() as lifetime:
             await self._app(request.scope, receive, self._while_valid(request, request.secret, send, lifetime))
-        if lifetime.cancel_called:
-            await send({"type": "http.response.body", "body": b"", "more_body": False})
+        if not lifetime.cancel_called:
+            return
+        if not request.is_answered_by_events:
+            # With a proper end, a part of an archive would look like all of it.
+            raise CutError(f"{request.method} {request.path}: its token has expired or was revoked meanwhile.")
+        await send({"type": "http.response.body", "body": b"", "more_body": False})
 
     def _while_valid(self, request: _Request, secret: str, send: Send, lifetime: anyio.CancelScope) -> Send:
-        """Return a `send` that ends a stream before its next part, once the token is no longer valid."""
+        """Return a `send` that ends a stream before its next part, once the token is no longer valid.
+
+        Where that can't be found out just now, a stream of events ends, too: its client comes back and goes on from
+        there. A download would have to begin anew, so it goes on, and it is asked again a moment later.
+        """
         tokens = self._gate.tokens
         checked_at, is_stream = tokens.now(), False
 
         async def sending(message: Message) -> None:
             nonlocal checked_at, is_stream
             if message["type"] == "http.response.start":
-                is_stream = not any(name.lower() == b"content-length" for name, _ in message["headers"])
+                headers = _headers(message["headers"])
+                is_stream = b"content-length" not in headers
+                request.is_answered_by_events = headers.get(b"content-type", [b""])[0].startswith(_EVENTS)
             elif is_stream and not 0 <= tokens.now() - checked_at < FRESH_S:
                 checked_at = tokens.now()
-                if not await self._is_valid(secret, request.client):
+                is_valid = await self._is_valid(secret, request.client)
+                if is_valid is None:
+                    is_valid = not request.is_answered_by_events
+                if not is_valid:
                     lifetime.cancel()
                     await anyio.lowlevel.checkpoint()
             await send(message)
 
         return sending
 
-    async def _is_valid(self, secret: str, client: str) -> bool:
+    async def _is_valid(self, secret: str, client: str) -> bool | None:
+        """Whether a token is valid now; None: that is not known, as the database is away or too much is asked."""
         try:
             token = await anyio.to_thread.run_sync(self._gate.find, secret, client)
-        except (RefusedError, SQLAlchemyError):
-            return False
+        except RefusedError:
+            return None
+        except SQLAlchemyError as error:
+            self._gate.outages.failed("A request", error)
+            return None
         return token is not None and token.state(self._gate.tokens.now()) == "valid"
 
     async def _websocket(self, request: _Request, receive: Receive, send: Send) -> None:
@@ -208,6 +234,7 @@ class _Request:
         self.headers = _headers(scope["headers"])
         self.host: Host
         self.secret: str | None = None
+        self.is_answered_by_events = False
 
     @property
     def scheme(self) -> str:

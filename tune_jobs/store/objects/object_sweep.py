@@ -9,6 +9,7 @@ import hashlib
 import itertools
 import secrets
 import shutil
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -18,7 +19,7 @@ from typing import Any
 from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, SpecError
 from tune_jobs.store import names
-from tune_jobs.store.command_names import name_in_commands, watch_or_end
+from tune_jobs.store.command_names import name_in_commands, still_driven, watch_or_end
 from tune_jobs.store.objects.asked import Asked
 from tune_jobs.store.objects.at_once import AT_ONCE, side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, Listed, StorageError
@@ -38,6 +39,8 @@ from tune_jobs.store.places import is_trial_id
 
 _LOCK, _DRIVER_LOCK = "lock.json", "driver-lock.json"
 _CLAIM, _STOP = "claim", "stop"
+_UNCLAIM_S = 2.0
+"""How long it is waited for that a name is free again."""
 
 
 class ObjectSweep(Artifacts):
@@ -83,20 +86,43 @@ class ObjectSweep(Artifacts):
         return (ours is not None and ours.found(names.SWEEP_RECORD) is not None) or bool(self.record_stamp())
 
     def create(self) -> None:
-        """Take the name; of several processes that want it at once, one gets it."""
+        """Take the name; of several processes that want it at once, one gets it.
+
+        Raises:
+            SpecError: The name is taken.
+            StorageError: The store doesn't answer, or refuses.
+        """
+        claim = secrets.token_bytes(8)
         try:
-            asked: list[Callable[[], bool]] = [self._claim, functools.partial(self._has, apart_from=_CLAIM)]
+            asked: list[Callable[[], bool]] = [
+                functools.partial(self._claim, claim),
+                functools.partial(self._has, apart_from=_CLAIM),
+            ]
             _, has_others = side_by_side(_answer, asked)
         except ConflictError as error:
             raise name_taken(self.url) from error
+        except StorageError:
+            # It may be there all the same, and would hold the name for ever. Who wants an answer now doesn't wait for
+            # a store that is away; a thread of its own is not told to be as impatient.
+            undoing = threading.Thread(target=self._unclaim, args=(claim,), daemon=True)
+            undoing.start()
+            undoing.join(_UNCLAIM_S)
+            raise
         if has_others:
             self._bucket.delete([_CLAIM])
             raise name_taken(self.url)
         self._is_made = True
 
-    def _claim(self) -> bool:
-        self._bucket.put(_CLAIM, secrets.token_bytes(8), is_new=True)
+    def _claim(self, claim: bytes) -> bool:
+        self._bucket.put(_CLAIM, claim, is_new=True)
         return True
+
+    def _unclaim(self, claim: bytes) -> None:
+        with contextlib.suppress(StorageError):
+            found = self._bucket.get(_CLAIM)
+            # Another process may have the name by now.
+            if found is not None and found.data == claim:
+                self._bucket.delete([_CLAIM])
 
     def _has(self, apart_from: str = "") -> bool:
         folders, objects = self._bucket.children()
@@ -227,7 +253,7 @@ class ObjectSweep(Artifacts):
         ):
             # It is taken for one that holds the other: nobody has.
             if not beating.is_first and is_leased(self._bucket, _DRIVER_LOCK, LEASE_S, believed_s=0.0):
-                raise CannotRunError(*self._still_driven)
+                raise CannotRunError(*still_driven(self.name))
             self._parts.is_locked = beating.is_ours
             try:
                 yield
@@ -241,15 +267,8 @@ class ObjectSweep(Artifacts):
     @contextlib.contextmanager
     def driver_lock(self) -> Iterator[None]:
         """Drive it on a cluster, for a client that holds `lock`."""
-        with leased(self._bucket, _DRIVER_LOCK, *self._still_driven):
+        with leased(self._bucket, _DRIVER_LOCK, *still_driven(self.name)):
             yield
-
-    @property
-    def _still_driven(self) -> tuple[str, str]:
-        return (
-            f"A cluster still runs sweep {self.name}, for a process that has ended.",
-            "Try again in a minute: the cluster is ending the run.",
-        )
 
     def is_driven(self) -> bool:
         """Whether a process holds one of the locks."""

@@ -89,7 +89,9 @@ export function openNew(main, route) {
   );
   const editor = new Editor(editing, { label: "Sweep file, YAML", onChange: changed });
 
+  // What is submitted twice by accident is one sweep; what was changed since is another one.
   function changed() {
+    key = randomKey();
     sessionStorage.setItem(DRAFT, editor.text);
     later(PAUSE_MS);
   }
@@ -102,14 +104,12 @@ export function openNew(main, route) {
   // A preset that was changed is named after it, too.
   const names = () => ({ name: form.elements.name.value.trim() || null, default_name: choice.value || null });
 
-  // What is submitted twice by accident is one sweep; what was changed since is another one.
   form.addEventListener("input", (event) => {
     key = randomKey();
     if (event.target === form.elements.name) later(PAUSE_MS);
   });
 
   async function check() {
-    key = randomKey();
     if (!maySubmit()) return;
     asked?.abort();
     asked = new AbortController();
@@ -129,6 +129,7 @@ export function openNew(main, route) {
   }
 
   function load(text, name) {
+    key = randomKey();
     editor.text = text;
     choice.value = name;
     describe(name);

@@ -1,0 +1,70 @@
+"""Values that a caller gives a client: NumPy's are taken, and what JSON can't hold is the error of this machine."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from client_fixtures import alone  # noqa: F401 (a fixture)
+from live_service import Live, live  # noqa: F401 (a fixture)
+from services import FAKE
+from sweep_folders import make_sweep_folder
+
+from policies.errors import SpecError
+from tune_jobs.client import Client
+from tune_jobs.sweeps import verbs
+
+# ruff: noqa: F811 - fixtures are named as arguments
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def client(live: Live) -> Iterator[Client]:
+    make_sweep_folder(live.storage / "done")
+    with Client(live.url) as made:
+        yield made
+
+
+def test_a_point_that_json_cannot_hold_is_refused_as_on_this_machine(client: Client, live: Live) -> None:
+    told = []
+    for inject in (
+        lambda: client.inject("done", {"lr": NAN}),
+        lambda: verbs.inject(live.storage / "done", {"lr": NAN}),
+    ):
+        with pytest.raises(SpecError) as raised:
+            inject()
+        told.append((raised.value.message, raised.value.hint))
+    assert told == [("point: lr: nan is not a finite number", "Give a finite number.")] * 2
+    with pytest.raises(SpecError, match=r"point: lr: .* of type set"):
+        client.inject("done", {"lr": {0.5}})
+
+
+def test_numbers_of_numpy_are_taken(client: Client) -> None:
+    assert client.inject("done", {"lr": np.float32(0.5)}).arguments == {"point": {"lr": 0.5}}
+    assert client.extend("done", np.int64(3)).arguments == {"to_num_samples": 5}  # type: ignore[arg-type]
+    made = client.submit(FAKE, name="mine", priority=np.int64(4), tags=np.array(["a", "b"]))  # type: ignore[arg-type]
+    assert made.job.priority == 4
+    assert client.change("mine", priority=np.int64(5)).tags == ["a", "b"]  # type: ignore[arg-type]
+    assert client.job(made.job.id).priority == 5
+    top, seeds = np.array([2, 1])
+    assert client.replicate("done", top=top, seeds=seeds).arguments == {"top": 2, "seeds": 1}
+
+
+WRONG: dict[str, Callable[[Client], object]] = {
+    "priority: nan is not": lambda client: client.submit(FAKE, priority=NAN),  # type: ignore[arg-type]
+    "wait_for_nodes: inf is not": lambda client: client.submit(FAKE, wait_for_nodes=float("inf")),
+    r"tags: \[1\]: ": lambda client: client.submit(FAKE, tags=["a", b"b"]),  # type: ignore[list-item]
+    r"overrides: \[0\]: nan": lambda client: client.plan(FAKE, overrides=[NAN]),  # type: ignore[list-item]
+    "num_samples: nan is not": lambda client: client.extend("done", NAN),  # type: ignore[arg-type]
+    "top: nan is not": lambda client: client.replicate("done", top=NAN),  # type: ignore[arg-type]
+    "note: .* half a character": lambda client: client.change("done", note="\ud800"),
+    "key: '.*' has characters": lambda client: client.submit(FAKE, key="\u043a\u043b\u044e\u0447"),
+    r"key: 'a\\nb' has characters": lambda client: client.submit(FAKE, key="a\nb"),
+}
+
+
+@pytest.mark.parametrize("told", WRONG)
+def test_what_cannot_be_sent_is_told_by_its_name(client: Client, live: Live, told: str) -> None:
+    with pytest.raises(SpecError, match=f"^{told}"):
+        WRONG[told](client)
+    assert live.service.queue.jobs() == []
