@@ -191,7 +191,7 @@ class Packs:
         if self.spec.scheduler.type == "hyperband":
             grace = self.spec.scheduler.grace_env_steps or 1
             return HyperBand(grace, self.spec.stop.num_env_steps, self.spec.scheduler.reduction_factor)
-        return Population(self.spec, self.keeper.record, self._curves())
+        return Population(self.spec, self.keeper.record, self._curves(), self.keeper.all_records)
 
     def _curves(self) -> Evaluations | None:
         return Evaluations(self.store) if self.spec.scheduler.type == "pb2" else None

@@ -171,6 +171,17 @@ def test_intervals_go_by_the_evaluations_there_are() -> None:
     assert gains_of([record(0, {}), record(1, {})], {"t0000": curve(1, every=4)}, 400) == []
 
 
+def test_an_interval_after_a_copy_begins_with_the_next_evaluation_where_the_copied_score_is_not_known() -> None:
+    a, b = {"lr": 1.0}, {"lr": 2.0}
+    trials = [record(0, b, (4, "t0001", 4, a))]
+    # The jump from 2 to 50 is the copy's, and none that the new values have gained.
+    found = gains_of(trials, {"t0000": curve(1, 2, 50, 54, 56, 60)}, 400)
+    assert found == [Gain(1.0, 1, (2 - 1) / 0.5, a), Gain(2.0, 50, (54 - 50) / 0.5, b), Gain(3.0, 54, 60 - 54, b)]
+    # As where every evaluation is a comparison.
+    found = gains_of(trials, {"t0000": curve(2, 50, 54, every=4)}, 400)
+    assert found == [Gain(3.0, 50, 4.0, b)]
+
+
 def test_evaluations_are_read_once_and_again_where_results_were_replaced(tmp_path: Path) -> None:
     store = SweepStore(tmp_path / "mine")
     store.create()

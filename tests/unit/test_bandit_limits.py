@@ -41,6 +41,38 @@ def test_the_newest_intervals_alone_are_modelled_in_whatever_order_they_come() -
     assert proposed(coming, gains) == proposed(coming, gains[::-1]) == expected
 
 
+def test_a_trial_that_is_added_to_a_population_goes_by_the_intervals_of_its_own_time() -> None:
+    """Those of the trials that were there before go on to much later, when other values were best."""
+    rng = np.random.default_rng(3)
+    times = np.repeat(np.arange(1.0, 41.0), 16)
+    values = rng.random(len(times))
+    bests = np.where(times < 20, 0.1, 0.9)
+    gains = [
+        Gain(time, 0.0, 1.0 - abs(x - best), {"x": float(x)})
+        for time, x, best in zip(times, values, bests, strict=True)
+    ]
+    found = [proposed(Next(time, 0.0, {"x": 0.5}, []), gains)["x"] for time in (3.0, 38.0)]
+    assert found[0] < 0.3
+    assert found[1] > 0.7
+    near = [gain for gain in gains if gain.time <= 6]
+    assert len(near) == MOST_INTERVALS
+    assert proposed(Next(3.5, 0.0, {"x": 0.5}, []), gains) == proposed(Next(3.5, 0.0, {"x": 0.5}, []), near)
+
+
+def test_a_list_that_acts_as_a_range_has_changed_gets_a_drawn_value() -> None:
+    kind = DOMAIN.validate_python({"choice": ["a", "b", "c"], "when": {"n": [2, 3, 4]}})
+    space = {"n": DOMAIN.validate_python({"randint": [1, 5]}), "kind": kind}
+    found = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        gains = [Gain(float(at), 0.0, rng.normal(), {"n": 1}) for at in range(6)]
+        point = propose(Next(7.0, 0.0, {"n": 1}, []), space, gains, rng, 0.25)
+        assert ("kind" in point) is (point["n"] > 1)
+        found += [point["kind"]] if "kind" in point else []
+    assert len(found) > 30
+    assert all(found.count(value) > 5 for value in "abc"), found
+
+
 @pytest.mark.parametrize(
     "given",
     [

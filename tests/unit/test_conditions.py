@@ -137,6 +137,12 @@ def test_combinations_that_nobody_could_train_are_not_listed() -> None:
         ),
         ({"prioritized_alpha": ALPHA}, {}, "space.prioritized_alpha.when.replay", "is not searched, and always"),
         (
+            {"lr": {"uniform": [0, 1], "when": {"stop.num_env_steps": 1_000}}},
+            {},
+            "space.lr.when.stop.num_env_steps",
+            "is not searched, and the same for all trials: search stop.num_env_steps too, or take the condition out.",
+        ),
+        (
             {"replay": REPLAY, "prioritized_alpha": {"uniform": [0, 1], "when": {"replya": "prioritized"}}},
             {},
             "space.prioritized_alpha.when.replya",

@@ -168,6 +168,33 @@ def test_a_name_that_was_fixed_there_has_that_value(tmp_path: Path) -> None:
     assert {item.point["gamma"] for item in prior.points} == {0.95}
 
 
+@pytest.mark.parametrize("domain", [{"choice": [20_000, 50_000]}, {"lograndint": [10_000, 60_000]}])
+def test_trainings_that_were_all_of_one_length_there_have_that_length(tmp_path: Path, domain: dict[str, Any]) -> None:
+    write_earlier(tmp_path, stop={"num_env_steps": 50_000})
+    _, (prior,) = begun(tmp_path, space={**SPACE, "stop.num_env_steps": domain})
+    assert len(prior.points) == 11
+    assert {item.point["stop.num_env_steps"] for item in prior.points} == {50_000}
+
+
+def test_trainings_of_a_length_that_is_not_searched_here_tell_nothing(tmp_path: Path) -> None:
+    """As any value that was fixed there and lies outside of what is searched."""
+    write_earlier(tmp_path, stop={"num_env_steps": 50_000}, hyperparams={"gamma": 0.95})
+    for name, domain in (("stop.num_env_steps", {"choice": [20_000, 40_000]}), ("gamma", {"uniform": [0.96, 0.99]})):
+        with pytest.raises(SpecError, match="none of its 11 ended points lies in this space"):
+            begun(tmp_path, space={**SPACE, name: domain})
+
+
+def test_a_length_that_did_not_act_there_was_that_of_the_sweep(tmp_path: Path) -> None:
+    kinds = {"activation": {"choice": ["tanh", "relu"]}}
+    length = {"choice": [20_000, 50_000]}
+    write_earlier(tmp_path, space={**SPACE, **kinds, "stop.num_env_steps": {**length, "when": {"activation": "tanh"}}})
+    _, (prior,) = begun(tmp_path, space={**SPACE, **kinds, "stop.num_env_steps": length})
+    assert len(prior.points) == 11
+    idle = [item.point for item in prior.points if item.point["activation"] == "relu"]
+    assert idle
+    assert {point["stop.num_env_steps"] for point in idle} == {50_000}
+
+
 LAYERS = {"layers": {"number": 1, "sizes": [64, 128]}}
 
 

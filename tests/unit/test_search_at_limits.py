@@ -132,3 +132,24 @@ def test_a_value_of_a_list_is_in_the_middle_of_its_part(number: int) -> None:
         (place,) = cube.units([point])
         for step in (-0.45, 0.0, 0.45):
             assert cube.point(place + step / number) == point
+
+
+def test_a_drawn_point_of_the_forest_that_was_tried_is_not_tried_again_where_something_does_not_act() -> None:
+    """What does not act in a point is drawn too, and makes no other point of it."""
+    pytest.importorskip("sklearn")
+    space: dict[str, Any] = load_spec(
+        {
+            "env": "CartPole-v1", "algorithm": "dqn", "num_samples": 40,
+            "space": {
+                "replay": {"choice": ["uniform", "prioritized"]},
+                "n_step": {"choice": [1, 2, 3]},
+                "prioritized_alpha": {"uniform": [0.1, 1.0], "when": {"replay": "prioritized"}},
+                "hidden_sizes": {"layers": {"number": [1, 2], "sizes": [32, 64]}},
+            },
+        }
+    ).space  # fmt: skip
+    known: list[KnownPoint] = []
+    for index in range(20):
+        point = next_point("forest", space, known, index, seed=4)
+        assert all(item.point != point for item in known), index
+        known.append(KnownPoint(point, (float(point["n_step"] - (point["replay"] == "prioritized")),)))

@@ -13,7 +13,7 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +44,7 @@ _LOG = logging.getLogger(__name__)
 _ATTEMPTS = 20
 
 ReadRecord = Callable[[str], TrialRecord]
+ReadRecords = Callable[[], Sequence[TrialRecord]]
 ReadCurves = Callable[[Sequence[str]], Curves]
 Change = Callable[[str, Callable[[TrialRecord], TrialRecord]], None]
 
@@ -82,14 +83,25 @@ class Population:
         spec: The sweep.
         read: Returns the newest record of a trial.
         curves: Returns the evaluations of trials, by which pb2 chooses values; None: values are mutated.
+        all_records: Returns the newest record of every trial of the sweep, including those of earlier runs, which don't
+            begin again but are what pb2 knows; None: all trials begin in this run.
     """
 
-    def __init__(self, spec: SweepSpec, read: ReadRecord, curves: ReadCurves | None = None) -> None:
+    def __init__(
+        self,
+        spec: SweepSpec,
+        read: ReadRecord,
+        curves: ReadCurves | None = None,
+        all_records: ReadRecords | None = None,
+    ) -> None:
         self._spec = spec
         self._read = read
         self._curves = curves
+        self._all_records = all_records
         self._frequencies = spec.scheduler.frequencies
         self._members: dict[str, _Compared] = {}
+        self._ended: Collection[str] = ()
+        """The trials that had ended when this comparison began."""
         self._chosen: dict[str, dict[str, Any]] = {}
         """The points of trials that are copied to in this comparison, which their records may not have yet."""
 
@@ -148,7 +160,8 @@ class Population:
                 member.selected_from = standing.num_env_steps
                 selected.add(standing.trial_id)
         self._chosen = {}
-        ranking = self._ranking(others)
+        self._ended = others.ended()
+        ranking = self._ranking()
         return {
             standing.trial_id: self._decision(standing, ranking) if standing.trial_id in selected else Decision.SAVE
             for standing in standings
@@ -172,10 +185,11 @@ class Population:
     def ended(self, standing: Standing) -> None:
         """Do nothing: `Others` tells which trials have ended, including those that failed."""
 
-    def _ranking(self, others: Others) -> _Ranking:
+    def _ranking(self) -> _Ranking:
         """Rank the running trials that have a score, in each sub-population."""
-        ended = others.ended()
-        known = {name: member for name, member in self._members.items() if name not in ended and _is_scored(member)}
+        known = {
+            name: member for name, member in self._members.items() if name not in self._ended and _is_scored(member)
+        }
         scores = {name: _score(member) for name, member in known.items()}
         numbers = range(len(self._frequencies))
         ranked = [
@@ -195,10 +209,11 @@ class Population:
         if self._curves is None:
             return self._valid(point, lambda: mutate(point, space, rng, resample_probability))
         interval, score = self._spec.perturb_every_env_steps, _score(self._members[chosen])
-        others = [name for name in self._members if name != standing.trial_id]
+        others = [name for name in self._members if name != standing.trial_id and name not in self._ended]
         meanwhile = [self._chosen.get(name) or self._read(name).point for name in others]
         coming = Next(standing.num_env_steps / interval + 1, score, point, meanwhile)
-        gains = gains_of([self._read(name) for name in self._members], self._curves(list(self._members)), interval)
+        records = list(map(self._read, self._members)) if self._all_records is None else self._all_records()
+        gains = gains_of(records, self._curves([record.trial_id for record in records]), interval)
         return self._valid(point, lambda: propose(coming, space, gains, rng, resample_probability))
 
     def _valid(self, point: dict[str, Any], draw: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -264,10 +279,20 @@ class PopulationScheduler(TuneScheduler):
         store: The sweep's files.
         read: Returns the newest record of a trial.
         change: Changes a trial's record, on disk too.
+        all_records: As for `Population`.
     """
 
-    def __init__(self, spec: SweepSpec, store: Sweep, read: ReadRecord, change: Change) -> None:
-        self._population = Population(spec, read, Evaluations(store) if spec.scheduler.type == "pb2" else None)
+    def __init__(
+        self,
+        spec: SweepSpec,
+        store: Sweep,
+        read: ReadRecord,
+        change: Change,
+        *,
+        all_records: ReadRecords | None = None,
+    ) -> None:
+        curves = Evaluations(store) if spec.scheduler.type == "pb2" else None
+        self._population = Population(spec, read, curves, all_records)
         super().__init__(self._population)
         self._spec = spec
         self._store = store

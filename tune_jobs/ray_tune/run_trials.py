@@ -189,7 +189,10 @@ class _Run:
 
     def _build_scheduler(self) -> TrialScheduler:
         if self._spec.scheduler.is_population:
-            return PopulationScheduler(self._spec, self._store, self.keeper.record, self.keeper.change)
+            keeper = self.keeper
+            return PopulationScheduler(
+                self._spec, self._store, keeper.record, keeper.change, all_records=keeper.all_records
+            )
         return build_tune_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
 
     def _packs(self, trial_ids: Sequence[str], folder: str) -> None:

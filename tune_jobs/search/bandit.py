@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tune_jobs.search.mutation import mutate
+from tune_jobs.search.mutation import mutate_all
 from tune_jobs.search.one_thread import one_thread
 from tune_jobs.search.parts import Parts
+from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Domain, Range
 
 Floats = NDArray[np.float64]
 
 MOST_INTERVALS = 96
-"""The newest intervals that the model is made of; older ones say little about what is good now."""
+"""The intervals nearest in time that the model is made of; others say little about what is good now."""
 _LENGTH_SCALES = (0.15, 0.3, 0.6, 1.2)
 """Of values and scores, which are scaled to [0, 1]."""
 _FORGETTING = (0.0, 0.03, 0.1, 0.3)
@@ -79,14 +80,14 @@ def propose(
         space: Domains by hyperparameter.
         gains: What is known, in any order.
         rng: Draws the mutation of lists, and the candidates.
-        resample_probability: Of the mutation; see `mutate`.
+        resample_probability: Of the mutation; see `tune_jobs.search.mutation.mutate`.
     """
-    mutated = mutate(coming.point, space, rng, resample_probability)
+    mutated = mutate_all(coming.point, space, rng, resample_probability)
     parts = Parts(space)
     ranges = {name: domain for name, domain in parts.space.items() if isinstance(domain, Range)}
-    known = sorted(gains, key=lambda one: one.time)[-MOST_INTERVALS:]
+    known = _nearest(gains, coming.time)
     if not ranges or len(known) < 2:
-        return mutated
+        return Conditions(space).stripped(mutated)
     scale = _Scale(ranges, parts, [one.before for one in known])
     rows = scale.rows([one.before for one in known], [one.point for one in known])
     model = _Model.fitted(np.array([one.time for one in known]), rows, np.array([one.gain for one in known]))
@@ -94,7 +95,23 @@ def propose(
     meanwhile = scale.rows([coming.before] * len(coming.meanwhile), coming.meanwhile)
     bounds = model.upper_bounds(coming.time, scale.beside(coming.before, candidates), meanwhile)
     best = candidates[int(np.argmax(bounds))]
+    # Stripped now, as it depends on the ranges' new values too which of the lists act.
     return parts.point_of(parts.values_of(mutated) | scale.values(best))
+
+
+def _nearest(gains: Sequence[Gain], time: float) -> list[Gain]:
+    """Return the intervals that are nearest to a time, the oldest first.
+
+    Usually these are the newest, but trials that are added to a population have its later intervals ahead of them.
+    """
+    known = sorted(gains, key=lambda one: one.time)
+    first, end = 0, len(known)
+    while end - first > MOST_INTERVALS:
+        if time - known[first].time >= known[end - 1].time - time:
+            first += 1
+        else:
+            end -= 1
+    return known[first:end]
 
 
 class _Scale:

@@ -41,6 +41,9 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     rng = random_streams.model_draws(question.seed, question.index)
     if rng.random() < _RANDOM_SHARE:
         point = draw_point(question.space, question.index, question.seed)
+        if question.parts is not None:
+            # With the values that points have of what does not act in them, or one that was tried would look new.
+            point = question.parts.values_of(question.parts.point_of(point))
         # One that was tried is no look at anything new, where a space is small.
         if all(item.point != point for item in question.known):
             with suppress(SpecError):

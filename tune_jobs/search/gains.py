@@ -64,7 +64,7 @@ def gains_of(records: Sequence[TrialRecord], curves: Curves, interval: int) -> l
     """Return the intervals of all trials, each from one comparison to the next.
 
     Where an interval begins with a change, it begins at the score of the trial that was copied. A trial's first one
-    begins at its first evaluation.
+    begins at its first evaluation, and so does one after a copy of a trial whose score is not known.
 
     Args:
         records: The trials.
@@ -78,7 +78,7 @@ def _of_trial(record: TrialRecord, curves: Curves, interval: int) -> list[Gain]:
     changes = {change.iteration: change for change in record.changes}
     found: list[Gain] = []
     begin: tuple[int, float] | None = None
-    """Env steps and score at the interval's beginning."""
+    """Env steps and score at the interval's beginning; None: not known yet."""
     due = interval
     for score in curves.get(record.trial_id, ()):
         change = changes.get(score.iteration)
@@ -89,11 +89,12 @@ def _of_trial(record: TrialRecord, curves: Curves, interval: int) -> list[Gain]:
                 point = _point_until(record, score.iteration)
                 time = score.num_env_steps / interval
                 found.append(Gain(time, before, (score.value - before) / length, point))
-            value = score.value
+            value: float | None = score.value
             if change is not None:
-                copied = _score_at(curves.get(change.source_trial_id, ()), change.source_iteration)
-                value = score.value if copied is None else copied
-            begin, due = (score.num_env_steps, value), score.num_env_steps + interval
+                # The trial's own score is none of the weights that it goes on with.
+                value = _score_at(curves.get(change.source_trial_id, ()), change.source_iteration)
+            begin = None if value is None else (score.num_env_steps, value)
+            due = score.num_env_steps + interval
         elif begin is None:
             begin = score.num_env_steps, score.value
     return found

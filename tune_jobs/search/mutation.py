@@ -33,13 +33,19 @@ def mutate(
         rng: Draws everything.
         resample_probability: The probability, in [0, 1], that a value is drawn anew and not changed to a neighbour.
     """
-    mutated = {
+    return Conditions(space).stripped(mutate_all(point, space, rng, resample_probability))
+
+
+def mutate_all(
+    point: Mapping[str, Any], space: Mapping[str, Domain], rng: np.random.Generator, resample_probability: float
+) -> dict[str, Any]:
+    """Return a value of each hyperparameter, also of those that do not act; see `mutate`."""
+    return {
         name: domain.sample(rng)
         if rng.random() < resample_probability or name not in point
         else _neighbour(domain, point[name], rng)
         for name, domain in space.items()
     }
-    return Conditions(space).stripped(mutated)
 
 
 def _neighbour(domain: BaseModel, value: Any, rng: np.random.Generator) -> Any:

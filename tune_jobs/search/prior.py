@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
+from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, TrialRecord
 from analysis.wording import counted, is_number
 from policies.errors import SpecError, shortened
 from tune_jobs.search.chosen_point import as_written, outside
@@ -60,7 +60,7 @@ def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
     different += [
         f"{name} is searched here, and neither searched nor fixed there"
         for name in spec.space
-        if name not in earlier.space and name not in earlier.hyperparams
+        if name not in earlier.space and name not in _fixed_in(earlier)
     ]
     different += [f"{name} is searched there, and not here" for name in earlier.space if name not in spec.space]
     if earlier.scheduler.is_population:
@@ -72,9 +72,14 @@ def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
         )
 
 
+def _fixed_in(earlier: SweepSpec) -> dict[str, Any]:
+    """Return what trials of an earlier sweep have where nothing is searched, or where that does not act."""
+    return {**earlier.hyperparams, TRAINING_LENGTH: earlier.stop.num_env_steps}
+
+
 def _seen_by(spec: SweepSpec, earlier: SweepSpec, known: KnownPoint) -> dict[str, Any] | None:
     """Return a point with the names of the new sweep; None: it could not have that point."""
-    values = {name: earlier.hyperparams[name] for name in spec.space if name in earlier.hyperparams} | dict(known.point)
+    values = {name: value for name, value in _fixed_in(earlier).items() if name in spec.space} | dict(known.point)
     try:
         # The other sweep may have listed or fixed the same value in another form, as 64 for [64].
         values = {name: _in_form_of(spec, name, value) for name, value in values.items()}

@@ -96,6 +96,11 @@ def _problems_of(given: _Given, name: str, other: str, wanted: Any) -> Iterator[
 
 def _not_searched(given: _Given, name: str, other: str) -> str:
     fields = HYPERPARAMS_BY_ALGORITHM[given.algorithm].model_fields
+    if other == TRAINING_LENGTH:
+        return (
+            f"is not searched, and the same for all trials: search {other} too, or take the condition out. {name} "
+            "would act always or never"
+        )
     if other in given.fixed:
         told = f"is fixed at {yaml_text(given.fixed[other])} under hyperparams, not searched"
         return f"{told}, so that {name} acts always or never: search {other} too, or take the condition out"
