@@ -45,6 +45,8 @@ _INSTALLED_BY = {
 """What brings a module that is called otherwise; setuptools had pkg_resources up to version 81."""
 _RESET_TAKES_LESS = re.compile(r"\breset\(\) got an unexpected keyword argument '(?:seed|options)'")
 """What Python says where an env has the `reset` of an older Gym, or a part of Gymnasium's."""
+_TAKES_NO_MODE = re.compile(r"\bgot an unexpected keyword argument 'render_mode'")
+"""What Python says where a class that draws, by its metadata or those of what it wraps, can't be told to."""
 _BY_WORDS = (
     (
         BaseException,
@@ -60,6 +62,14 @@ _BY_WORDS = (
         (
             "Gymnasium's reset is given both by name: def reset(self, *, seed=None, options=None). Mend the env's, or "
             "wrap it in a class of your own that calls it without."
+        ),
+    ),
+    (
+        TypeError,
+        _TAKES_NO_MODE,
+        (
+            "To be drawn, it is made with render_mode='rgb_array': let what makes the env take render_mode=None, and "
+            "hand it on to the env that it wraps, or draw with it."
         ),
     ),
 )

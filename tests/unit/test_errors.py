@@ -76,6 +76,8 @@ def test_an_envs_error_can_be_told(error: ValueError | MuteError | WordlessError
         (ImportError("libfoo is not there"), "Install the package"),
         (TypeError("Drive.reset() got an unexpected keyword argument 'options'"), "def reset(self, *, seed=None, "),
         (TypeError("reset() got an unexpected keyword argument 'seed'"), "def reset(self, *, seed=None, "),
+        (TypeError("Masked.__init__() got an unexpected keyword argument 'render_mode'"), "take render_mode=None, "),
+        (TypeError("Masked.__init__() got an unexpected keyword argument 'mode'"), None),
         (TypeError("preset() got an unexpected keyword argument 'seed'"), None),
         (ValueError("reset() got an unexpected keyword argument 'seed'"), None),
         (AttributeError("module 'nump' has no attribute 'bool8'"), None),
