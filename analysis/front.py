@@ -44,8 +44,7 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
     """
     if not ranking or not all(math.isfinite(item.expected) for item in ranking):
         return None
-    # The cheapest first; of equal ones, the best.
-    order = sorted(range(len(ranking)), key=lambda index: (ranking[index].cost, index))
+    order = _by_cost(ranking)
     on_front = _non_dominated(ranking, order)
     best = ranking[0].expected
     gained = 0.0 if untrained is None else max(0.0, best - untrained)
@@ -76,14 +75,14 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
 
 
 def other_settings(ranking: Sequence[SettingScores], front: FrontRecord, most: int) -> list[SettingScores]:
-    """Return the settings that are neither listed on a front nor among its undecided, best first; evenly, if too many.
+    """Return the settings that are neither on a front nor among its undecided, best first; evenly, if too many.
 
     Args:
         ranking: The settings that the front is of, best first.
         front: Their front.
         most: How many are wanted at most.
     """
-    known = {item.point_index for item in (*front.points, *front.undecided)}
+    known = points_on_front(ranking) | {item.point_index for item in front.undecided}
     others = [item for item in ranking if item.point_index not in known]
     picks = np.linspace(0, len(others) - 1, min(len(others), most)).round().astype(int).tolist()
     return [others[pick] for pick in picks]
@@ -111,12 +110,21 @@ def untrained_return(results: Mapping[str, Sequence[IterationRecord]]) -> float 
     return statistics.median(found) if found else None
 
 
+def settings_on_front(ranking: Sequence[SettingScores]) -> list[SettingScores]:
+    """Return all settings on the front, the cheapest first, of which a record lists some; their scores are finite."""
+    return [ranking[index] for index in _non_dominated(ranking, _by_cost(ranking))]
+
+
 def points_on_front(ranking: Sequence[SettingScores]) -> set[int]:
     """Return the indices of the points whose settings are on the front."""
     if not all(math.isfinite(item.expected) for item in ranking):
         return set()
-    order = sorted(range(len(ranking)), key=lambda index: (ranking[index].cost, index))
-    return {ranking[index].point_index for index in _non_dominated(ranking, order)}
+    return {item.point_index for item in settings_on_front(ranking)}
+
+
+def _by_cost(ranking: Sequence[SettingScores]) -> list[int]:
+    """Return the indices of settings, the cheapest first; of equal ones, the best."""
+    return sorted(range(len(ranking)), key=lambda index: (ranking[index].cost, index))
 
 
 def _non_dominated(ranking: Sequence[SettingScores], order: Sequence[int]) -> list[int]:

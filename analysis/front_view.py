@@ -6,15 +6,16 @@ from pydantic import Field
 
 from analysis.best_records import FrontRecord
 from analysis.exports.frames import SweepData, ranked_settings
-from analysis.front import costs_lie_far_apart, front_of, other_settings, untrained_return
+from analysis.front import costs_lie_far_apart, front_of, other_settings, settings_on_front, untrained_return
 from analysis.front_words import about_front, cheapest_near_text
+from analysis.objectives import SettingScores
 from analysis.records import Cost, Count, Number, Objective, Record
 
 _MOST_OTHERS = 1_000
 
 
 class OtherSettingRecord(Record):
-    """A setting that is not on the front."""
+    """A setting that is not listed on the front."""
 
     rank: Count = Field(description="Its place among the settings, by score; 1: the best.")
     point_index: Count
@@ -29,6 +30,9 @@ class FrontView(Record):
     num_settings: Count = Field(description="All that have ended trials.")
     front: FrontRecord | None = Field(
         None, description="Their front; null: the sweep doesn't ask for it, or has nothing to judge them by yet."
+    )
+    more_on_front: tuple[OtherSettingRecord, ...] = Field(
+        (), description="Those on it beyond the ones that `front` lists, the cheapest first."
     )
     others: tuple[OtherSettingRecord, ...] = Field(
         (),
@@ -51,18 +55,22 @@ def front_view(data: SweepData, cost: Cost | None) -> FrontView:
     if front is None:
         return FrontView(objective=data.objective, num_settings=len(ranking))
     ranks = {item.point_index: rank for rank, item in enumerate(ranking, start=1)}
+
+    def told(item: SettingScores) -> OtherSettingRecord:
+        return OtherSettingRecord(
+            rank=ranks[item.point_index],
+            point_index=item.point_index,
+            expected=item.expected,
+            num_env_steps=item.cost,
+        )
+
     return FrontView(
         objective=data.objective,
         num_settings=len(ranking),
         front=front,
-        others=tuple(
-            OtherSettingRecord(
-                rank=ranks[item.point_index], point_index=item.point_index, expected=item.expected,
-                num_env_steps=item.cost,
-            )
-            for item in other_settings(ranking, front, _MOST_OTHERS)
-        ),
+        more_on_front=tuple(map(told, settings_on_front(ranking)[len(front.points) :])),
+        others=tuple(map(told, other_settings(ranking, front, _MOST_OTHERS))),
         costs_lie_far_apart=costs_lie_far_apart(ranking),
         cheapest_near=cheapest_near_text(front),
         about=tuple(about_front(front)),
-    )  # fmt: skip
+    )

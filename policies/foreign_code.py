@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from policies.foreign_envs import NO_IMAGES, env_kwargs, known_env, sb3_env
 from policies.foreign_phases import rllib_phase, rllib_target, sb3_phase, sb3_target
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.schedules import linear
@@ -40,7 +41,6 @@ class _Code:
 
 
 _NO_CLIPPING = _Code('float("inf")')
-_NO_IMAGES = "The env's own observations are no images, as the convolutions need: wrap it."
 
 
 def stable_baselines3_program(
@@ -50,6 +50,7 @@ def stable_baselines3_program(
     env_args: Mapping[str, Any],
     num_env_steps: int,
     flattens: bool = False,
+    may_be_continuous: bool = False,
 ) -> ForeignProgram:
     """Return a program that trains with a setting in Stable-Baselines3 2.7 or later.
 
@@ -59,9 +60,11 @@ def stable_baselines3_program(
         env_args: Keyword arguments of the environment.
         num_env_steps: Env steps to train.
         flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
+        may_be_continuous: Whether a note on continuous actions is wanted.
     """
     is_ppo = isinstance(values, PPOHyperparams)
-    env_id, imports_of_class, registration = _registered(env_id)
+    env = known_env(env_id)
+    made = sb3_env(values, env, env_args, flattens=flattens)
     arguments, notes = _sb3_ppo(values) if isinstance(values, PPOHyperparams) else _sb3_dqn(values, num_env_steps)
     learning_rate: Any = values.lr
     if values.lr_final is not None and values.lr_decay_steps is not None:
@@ -79,23 +82,15 @@ def stable_baselines3_program(
     if values.initializer == "he_uniform" or (values.initializer == "orthogonal" and not is_ppo):
         notes.append(f"initializer {values.initializer} is left out: it takes a policy class of your own.")
     if values.conv_filters is not None:
-        notes.append("conv_filters are left out: SB3's are those of CnnPolicy, or of a features extractor of your own.")
+        # Three convolutions of 8, 4 and 3 pixels, each 4, 2 and 1 apart.
+        notes.append(
+            "conv_filters are left out: CnnPolicy has its own, for images of bytes of 36 x 36 pixels or more; others "
+            "take a features extractor that you write."
+        )
+    if may_be_continuous and isinstance(values, PPOHyperparams):
+        notes.append(_sb3_continuous(values))
     name = "PPO" if is_ppo else "DQN"
-    wrapper, imports = "", ["import torch", f"from stable_baselines3 import {name}"]
-    if flattens and values.conv_filters is None:
-        wrapper = ", wrapper_class=FlattenObservation"
-        imports.insert(0, "from gymnasium.wrappers import FlattenObservation")
-    elif flattens:
-        notes += [_NO_IMAGES, "If they are a Dict, MultiInputPolicy takes them, with convolutions of its own."]
-    made = f"make_vec_env({env_id!r}, n_envs={values.num_envs}{wrapper}{_env_kwargs('env_kwargs', env_args)})"
-    imports += ["from stable_baselines3.common.env_util import make_vec_env"]
-    lines = [f"env = {made}"]
-    scales = isinstance(values, PPOHyperparams) and values.normalize_rewards
-    if values.normalize_observations or scales:
-        imports += ["from stable_baselines3.common.vec_env import VecNormalize"]
-        norm_obs = "" if values.normalize_observations else ", norm_obs=False"
-        norm_reward = f"gamma={values.gamma!r}" if scales else "norm_reward=False"
-        lines += [f"env = VecNormalize(env{norm_obs}, {norm_reward})"]
+    imports = [*env.imports, "import torch", f"from stable_baselines3 import {name}", *made.imports]
     call = {
         "learning_rate": learning_rate,
         "gamma": values.gamma,
@@ -104,8 +99,9 @@ def stable_baselines3_program(
         "policy_kwargs": network,
     }
     policy = "MlpPolicy" if values.conv_filters is None else "CnnPolicy"
-    lines += [_call(f"model = {name}", [repr(policy), "env"], call), f"model.learn(total_timesteps={num_env_steps})"]
-    return ForeignProgram("\n".join([*imports_of_class, *imports, "", *registration, *lines]), tuple(notes))
+    model = _call(f"model = {name}", [repr(policy), "env"], call)
+    lines = [*env.registration, *made.lines, model, f"model.learn(total_timesteps={num_env_steps})"]
+    return ForeignProgram("\n".join([*imports, "", *lines]), (*env.notes, *notes, *made.notes))
 
 
 def rllib_program(
@@ -119,7 +115,8 @@ def rllib_program(
         env_args: Keyword arguments of the environment.
         flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
     """
-    env_id, imports, registration = _registered(env_id)
+    env = known_env(env_id)
+    env_id, imports, registration = env.env_id, list(env.imports), list(env.registration)
     arguments, notes = _rllib_ppo(values) if isinstance(values, PPOHyperparams) else _rllib_dqn(values)
     name = "PPO" if isinstance(values, PPOHyperparams) else "DQN"
     activation = "GELU" if values.activation == "gelu" else values.activation
@@ -150,7 +147,7 @@ def rllib_program(
     if flattens and values.conv_filters is None:
         # RLlib has no argument for an env's wrapper, and its layers take no whole numbers.
         imports = [
-            *(imports or ["import gymnasium"]),
+            *dict.fromkeys([*imports, "import gymnasium"]),
             "import numpy",
             "from gymnasium.wrappers import DtypeObservation, FlattenObservation",
             "from ray.tune import register_env",
@@ -159,9 +156,9 @@ def rllib_program(
         registration += [f'register_env("flattened", lambda config: {made})', ""]
         env_id = "flattened"
     elif flattens:
-        notes.append(_NO_IMAGES)
+        notes.append(NO_IMAGES)
     chain = [
-        f".environment({env_id!r}{_env_kwargs('env_config', env_args)})",
+        f".environment({env_id!r}{env_kwargs('env_config', env_args)})",
         _call(".env_runners", [], runners),
         ".learners(num_learners=0)",
         _call(".training", [], training),
@@ -174,7 +171,7 @@ def rllib_program(
     ]
     made = f"config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
     code = "\n".join([*imports, "", *registration, made])
-    return ForeignProgram(code, tuple(notes))
+    return ForeignProgram(code, (*env.notes, *notes))
 
 
 def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
@@ -207,6 +204,17 @@ def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
         **({} if values.vf_clip_range is None else {"clip_range_vf": values.vf_clip_range}),
         **({} if values.normalize_advantages else {"normalize_advantage": False}),
     }, notes
+
+
+def _sb3_continuous(values: PPOHyperparams) -> str:
+    """Return what SB3 does otherwise with actions of a Box; RLlib does as we do where all bounds are finite."""
+    note = (
+        "If actions are continuous, SB3 clips them to their bounds, over which ours stretch -1 to 1 "
+        "(Gymnasium's RescaleAction does that)"
+    )
+    if values.free_log_std:
+        return f"{note}."
+    return f"{note}, and its deviation is one for all observations, of which ours has one for each."
 
 
 def _sb3_optimizer(values: TrainedHyperparams) -> dict[str, Any]:
@@ -343,23 +351,6 @@ def _lacking_in_both(values: DQNHyperparams) -> dict[str, bool]:
 def _dqn_notes(library: str, lacks: Mapping[str, bool]) -> list[str]:
     lacking = [name for name, is_wanted in lacks.items() if is_wanted]
     return [f"{library}'s DQN lacks {', '.join(lacking)}."] if lacking else []
-
-
-def _registered(env_id: str) -> tuple[str, list[str], list[str]]:
-    """Return the id by which Gymnasium knows an environment, with the imports and the lines that register it.
-
-    It knows none of a class that is written `module:Class`, as no version is in its name; all others need no lines.
-    """
-    module, colon, name = env_id.partition(":")
-    if not colon or not name.isidentifier():
-        return env_id, [], []
-    own = f"{name}-v0"
-    call = f"gymnasium.register({own!r}, lambda **args: {module}.{name}(**args))"
-    return own, ["import gymnasium", f"import {module}"], [call, ""]
-
-
-def _env_kwargs(name: str, env_args: Mapping[str, Any]) -> str:
-    return f", {name}={dict(env_args)!r}" if env_args else ""
 
 
 def _call(function: str, positional: list[str], arguments: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots, drawable
 from analysis.charts.subject import Subject
-from analysis.front import costs_lie_far_apart, front_of, other_settings, untrained_return
+from analysis.front import costs_lie_far_apart, front_of, other_settings, settings_on_front, untrained_return
 from analysis.objectives import SettingScores
 
 _FRONT = "the front"
@@ -20,7 +20,8 @@ def make_charts(subject: Subject) -> list[Chart]:
     if front is None or len(ranking) < 2:
         return []
     by_point = {item.point_index: item for item in ranking}
-    on_front = [by_point[item.point_index] for item in front.points]
+    # All of it, where the record lists some: the line is said to have nothing above it.
+    on_front = settings_on_front(ranking)
     may_be = [by_point[item.point_index] for item in front.undecided]
     others = other_settings(ranking, front, _MAX_DRAWN)
     num_others = len(ranking) - len(on_front) - len(may_be)

@@ -152,7 +152,15 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     for title, program in (
         (
             "The setting in Stable-Baselines3",
-            stable_baselines3_program(values, env_id=env_id, env_args=env_args, num_env_steps=cap, flattens=flattens),
+            # The record says of actions alone whether they are masked, and those that are have numbers.
+            stable_baselines3_program(
+                values,
+                env_id=env_id,
+                env_args=env_args,
+                num_env_steps=cap,
+                flattens=flattens,
+                may_be_continuous=not is_masked,
+            ),
         ),
         ("The setting in RLlib", rllib_program(values, env_id=env_id, env_args=env_args, flattens=flattens)),
     ):

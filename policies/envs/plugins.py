@@ -12,6 +12,7 @@ import functools
 import importlib
 import importlib.util
 from importlib import metadata
+from typing import NamedTuple
 
 from gymnasium.envs import registration
 
@@ -21,6 +22,47 @@ GROUP = "gymnasium.envs"
 _NO_NAMESPACE = "__root__"
 _REGISTER_WHEN_IMPORTED = {"ale_py": "ale-py"}
 """Packages without such an entry point that register their environments when they are imported, with their names."""
+
+
+class Registering(NamedTuple):
+    """The function by which an installed package registers its environments."""
+
+    package: str
+    module: str
+    attr: str
+    """Its name in the module."""
+    namespace: str | None
+
+
+def who_may_register(env_id: str) -> list[Registering]:
+    """Return the functions of which one registers an id, as far as their names tell; nothing is imported for it.
+
+    They are those of its namespace, or else those of none, which may register any; an id of Gymnasium's own has none.
+    """
+    if _is_gymnasiums_own(env_id):
+        return []
+    found = [
+        Registering(
+            _package_of(entry_point), entry_point.module, entry_point.attr,
+            None if entry_point.name == _NO_NAMESPACE else entry_point.name,
+        )
+        for entry_point in metadata.entry_points(group=GROUP)
+    ]  # fmt: skip
+    namespace = env_id.rpartition("/")[0]
+    return [item for item in found if item.namespace == namespace] or [item for item in found if item.namespace is None]
+
+
+def _is_gymnasiums_own(env_id: str) -> bool:
+    """Whether Gymnasium registers an id, with or without its version, when it is imported."""
+    return any(
+        str(spec.entry_point).startswith("gymnasium.")
+        for known, spec in registration.registry.items()
+        if env_id in (known, known.rpartition("-v")[0])
+    )
+
+
+def _package_of(entry_point: metadata.EntryPoint) -> str:
+    return entry_point.dist.name if entry_point.dist is not None else entry_point.value
 
 
 @functools.cache
@@ -37,8 +79,7 @@ def load_env_plugins() -> tuple[str, ...]:
         try:
             entry_point.load()()
         except Exception as error:  # noqa: BLE001 (then only its own environments are missing)
-            package = entry_point.dist.name if entry_point.dist is not None else entry_point.value
-            problems.append(_could_not(package, error))
+            problems.append(_could_not(_package_of(entry_point), error))
         finally:
             registration.current_namespace = before
     for module, package in _REGISTER_WHEN_IMPORTED.items():

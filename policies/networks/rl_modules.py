@@ -225,6 +225,12 @@ def _own_class(hyperparams: TrainedHyperparams, rl_module: str) -> type[RLModule
                 "exploration has linear schedules only.",
                 "Derive the class from policies.networks.DQNModule, or set epsilon_schedule: linear.",
             )
+        if hyperparams.epsilon_unit != "env_step" and not issubclass(found, EpsilonGreedy):
+            raise SpecError(
+                f"epsilon_unit {hyperparams.epsilon_unit} does not reach rl_module {rl_module!r}: RLlib's own "
+                "exploration counts env steps only.",
+                "Derive the class from policies.networks.DQNModule, or set epsilon_unit: env_step.",
+            )
         if not hyperparams.target_network and not issubclass(found, DQNModule):
             raise SpecError(
                 f"target_network is false, but rl_module {rl_module!r} always has a target network, like RLlib's own.",

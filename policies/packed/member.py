@@ -62,6 +62,8 @@ class Member(Generic[H_co]):
     num_target_updates: int = 0
     failure_penalty: float | None = None
     """Reward of env steps that end an episode by failure; None: the env's own reward."""
+    atari_training: dict[str, bool] | None = None
+    """The arguments of the `AtariTraining` that it learns through; None: it learns from games as they are."""
     rng: np.random.Generator = field(kw_only=True)
     """Draws actions, permutations and batches."""
 

@@ -51,6 +51,7 @@ def save_member(member: AnyMember, folder: Path) -> None:
         "seed": member.seed,
         "counters": {name: getattr(member, name) for name in _COUNTERS},
         "failure_penalty": member.failure_penalty,
+        "atari_training": member.atari_training,
         **({_RETURNS: vars(member.return_statistics)} if _normalizes_rewards(member.hyperparams) else {}),
         "rng": member.rng.bit_generator.state,
     }
@@ -95,6 +96,8 @@ def load_member(folder: Path, member_id: str) -> AnyMember:
             moments=parts,
             rng=rng,
             failure_penalty=None if description["failure_penalty"] is None else _number(description["failure_penalty"]),
+            # Written since later than the format's first files.
+            atari_training=_switches(description.get("atari_training")),
             return_statistics=_return_statistics(description, hyperparams),
             **cast("Any", {name: _number(description["counters"][name]) for name in _COUNTERS}),
         )
@@ -117,6 +120,14 @@ def _return_statistics(description: dict[str, Any], hyperparams: Hyperparams) ->
 def _number(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{value!r} is no number")
+    return value
+
+
+def _switches(value: Any) -> dict[str, bool] | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or not all(isinstance(switch, bool) for switch in value.values()):
+        raise TypeError(f"{value!r} is no mapping to true or false")
     return value
 
 

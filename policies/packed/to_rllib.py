@@ -27,7 +27,8 @@ def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num
     """Restore a checkpoint of the packed engine as an RLlib Algorithm that can continue training.
 
     Weights, target networks, observation statistics, the optimizer's moments and the counters are the checkpoint's.
-    Random numbers differ from those the pack would have drawn, and a replay memory is empty.
+    Random numbers differ from those the pack would have drawn, and a replay memory is empty, and filled before anything
+    is learnt.
 
     Args:
         checkpoint: A checkpoint folder of a trial.
@@ -46,6 +47,7 @@ def algorithm_from_checkpoint(checkpoint: Path, *, num_env_runners: int = 0, num
         env_args=saved.env_args,
         expected=saved.network,
         failure_penalty=member.failure_penalty,
+        atari_training=member.atari_training,
         num_env_runners=num_env_runners,
         num_gpus=num_gpus,
     )
@@ -110,6 +112,7 @@ def _take_over(algorithm: Algorithm, member: AnyMember) -> None:
         algorithm.num_updates, algorithm._due = member.num_updates, member.due  # noqa: SLF001
         learner.target_updates_at = member.target_updates_at
         learner.num_target_updates = member.num_target_updates
+        algorithm.learn_after_refilling()
     else:
         # This dict makes its values when they are first asked for, so there are none to loop over yet.
         learner.curr_kl_coeffs_per_module[DEFAULT_MODULE_ID].data.fill_(member.kl_coeff)

@@ -53,7 +53,7 @@ class ReplayDQN(DQN):  # type: ignore[misc]
     """DQN with the variants of `DQNHyperparams`.
 
     Attributes:
-        replay: The replay memory. It is not in checkpoints: `refill` it after a restore.
+        replay: The replay memory. It is not in checkpoints: after a restore it is filled before anything is learnt.
         num_env_steps: Env steps so far.
         num_episodes: Whole episodes so far.
         num_updates: Updates so far.
@@ -72,6 +72,8 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         self.num_env_steps = self.num_episodes = self.num_updates = 0
         # Updates that are due but not made: `updates_per_env_step` may be a fraction.
         self._due = 0.0
+        # Env steps at which a restored Algorithm's replay memory is as full as it was when learning began.
+        self._refilled_at = 0
         self._copies: tuple[list[Tensor], list[Tensor]] | None = None
         self._new_observations: list[NDArray[Any]] = []
         self._last_episodes: deque[tuple[float, int]] = deque(maxlen=self.config.metrics_num_episodes_for_smoothing)
@@ -83,6 +85,13 @@ class ReplayDQN(DQN):  # type: ignore[misc]
     def seed_replay(self, seed: int) -> None:
         """Begin with an empty replay memory that draws its batches from this seed."""
         self.replay = make_replay(self.hyperparams, seed)
+
+    def learn_after_refilling(self) -> None:
+        """After a restore, wait with learning until the replay memory is as full as it was when learning began."""
+        hyperparams = self.hyperparams
+        # Without replay, the next steps fill it; one that has not learnt yet waits as it did.
+        if self.num_updates and hyperparams.replay != "none":
+            self._refilled_at = self.num_env_steps + max(hyperparams.learning_starts, hyperparams.train_batch_size)
 
     @property
     def hyperparams(self) -> DQNHyperparams:
@@ -103,7 +112,8 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         stats: dict[str, float] = {}
         while self.num_env_steps - start < hyperparams.env_steps_per_iteration:
             num_new_steps = self._sample()
-            if self.num_env_steps < hyperparams.learning_starts or len(self.replay) < hyperparams.train_batch_size:
+            begins_at = max(hyperparams.learning_starts, self._refilled_at)
+            if self.num_env_steps < begins_at or len(self.replay) < hyperparams.train_batch_size:
                 if self._learn_statistics():
                     self._send_weights()
                 continue
@@ -174,12 +184,17 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         return self.num_env_steps - steps
 
     def _learn_statistics(self) -> bool:
-        """Merge the observations since the last call into the statistics, if observations are normalised."""
+        """Merge the observations since the last call into the statistics; return whether there are any."""
         new, self._new_observations = self._new_observations, []
-        if self.hyperparams.normalize_observations:
-            for observations in new:
-                self.learner.module[DEFAULT_MODULE_ID].update_observation_statistics(observations)
-        return self.hyperparams.normalize_observations
+        # Those that refill the replay memory are in them already, as far as a policy goes on as it did.
+        if not self.hyperparams.normalize_observations or self.num_env_steps <= self._refilled_at:
+            return False
+        module = self.learner.module[DEFAULT_MODULE_ID]
+        if not hasattr(module, "update_observation_statistics"):
+            return False  # a user's own module, which normalises as it likes, as with PPO
+        for observations in new:
+            module.update_observation_statistics(observations)
+        return True
 
     def _send_weights(self) -> None:
         """Send the learner's weights to the env runners."""
@@ -217,3 +232,4 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         self.num_updates, self._due = counters["num_updates"], counters["due"]
         self.learner.target_updates_at = counters["target_updates_at"]
         self.learner.num_target_updates = counters["num_target_updates"]
+        self.learn_after_refilling()

@@ -1,5 +1,8 @@
 """The written programs for RLlib configure it as ours trains."""
 
+import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -122,3 +125,14 @@ def test_it_trains_on_a_class_of_ones_own(
     assert names["algorithm"].train()["num_env_steps_sampled_lifetime"] >= 64
     names["algorithm"].stop()
     del gym.registry[f"{name}-v0"]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ale_py") is None, reason="the emulator of Atari is not installed")
+@pytest.mark.parametrize("env_id", ["ALE/Pong-v5", "PongNoFrameskip-v4"])
+def test_it_finds_an_atari_game_in_a_fresh_process(env_id: str, tmp_path: Path) -> None:
+    values = PPOHyperparams(train_batch_size=64, minibatch_size=32, hidden_sizes=(8,))
+    code = rllib_program(values, env_id=env_id, env_args={"obs_type": "ram"}).code
+    code += "\nprint(algorithm.env_runner.env.single_observation_space)\nalgorithm.stop()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "Box(0, 255, (128,), uint8)"

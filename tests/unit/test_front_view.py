@@ -12,9 +12,14 @@ from page_sweeps import write_sweep
 from synthetic_sweep import make_points, make_sweep
 
 from analysis import front_view as module
+from analysis.charts.front import make_charts
+from analysis.charts.model import Plots
+from analysis.charts.subject import Subject
 from analysis.exports.frames import SweepData, ranked_settings
 from analysis.front_view import FrontView, front_view
 from analysis.front_words import cheapest_near_text
+from analysis.importance import what_mattered
+from analysis.objectives import SettingScores
 from analysis.settings import judge_settings
 from tests.narrowing import present
 from tune_jobs.sweeps.plain import to_json
@@ -54,6 +59,35 @@ def test_of_very_many_settings_some_are_left_out(monkeypatch: pytest.MonkeyPatch
     some = front_view(data, "env_steps").others
     assert len(some) == 5
     assert (some[0], some[-1]) == (all_others[0], all_others[-1])
+
+
+def test_all_of_a_long_front_is_told_and_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Each is dearer than the one before, and better.
+    settings = [SettingScores(i, {"lr": i}, (float(i),), (f"t{i:04d}",), 0, float(i), (1000 + i,)) for i in range(60)]
+    ranking = [*settings[::-1], dataclasses.replace(settings[0], point_index=60, expected=-1.0)]
+    monkeypatch.setattr(module, "ranked_settings", lambda _: ranking)
+    data = data_of(1, 1)
+    found = front_view(data, "env_steps")
+    front = present(found.front)
+    assert (len(front.points), front.num_on_front) == (50, 60)
+    told = [item.point_index for item in front.points] + [item.point_index for item in found.more_on_front]
+    assert told == list(range(60))
+    assert [(item.rank, item.expected, item.num_env_steps) for item in found.more_on_front[-1:]] == [(1, 59.0, 1059.0)]
+    assert [item.point_index for item in found.others] == [60]
+    made = make_sweep()
+    sweep = made.sweep.model_copy(update={"spec": {**made.sweep.spec, **COST}})
+    importance = what_mattered(sweep, made.trials, made.results, threshold=None)
+    monkeypatch.setattr(Subject, "settings", ranking)
+    subject = Subject(sweep, made.trials, made.results, None, importance)
+    (chart,) = make_charts(subject)
+    assert isinstance(chart.data, Plots)
+    (plot,) = chart.data.plots
+    (line,) = [item for item in plot.lines if item.is_stepped]
+    assert list(line.x) == [1000.0 + i for i in [*range(60), 59]]
+    assert list(line.y) == [float(i) for i in [*range(60), 59]]
+    drawn = {item.name: len(item.x) for item in plot.lines if not item.is_stepped}
+    assert drawn["the front"] == 60
+    assert drawn["other settings"] == 1
 
 
 def test_who_asks_for_no_cost_or_has_no_scores_has_none() -> None:

@@ -9,7 +9,7 @@ import pytest
 from sweep_folders import MACHINE, make_sweep_folder
 
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.memory import AtOnce, lowered_by_memory
+from tune_jobs.plan.memory import cpus_that_hold, lowered_by_memory
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
 from tune_jobs.ray_tune import run_trials
 from tune_jobs.ray_tune.cluster import Connection
@@ -40,29 +40,25 @@ MIXED: dict[str, Any] = {
 }  # fmt: skip
 
 
-def lowered(num_bytes: float, num_cpus: float = 16, cpus: int = 1, **more: Any) -> AtOnce:
-    machine = Machine(num_cpus, memory_bytes=16e9, **more)
-    at_once = int(num_cpus // cpus)
-    return lowered_by_memory(machine, num_bytes, at_once, cpus=cpus, algorithm="dqn", by_cpus=True)
-
-
 @pytest.mark.parametrize("num_bytes", [1e8, 6e8, 9e8, 1.1e9, 1.7e9, 2.7e9, 5e9, 9e9])
 @pytest.mark.parametrize(("num_cpus", "cpus"), [(16, 1), (15, 2), (7, 1), (2.5, 1), (1, 1)])
 def test_no_more_have_the_cpus_than_have_the_memory(num_bytes: float, num_cpus: float, cpus: int) -> None:
-    found = lowered(num_bytes, num_cpus, cpus)
-    assert found.number == max(1, int(num_cpus // found.cpus))
-    assert cpus <= found.cpus <= max(cpus, num_cpus)
-    by_number = lowered_by_memory(
-        Machine(num_cpus, memory_bytes=16e9), num_bytes, int(num_cpus // cpus), cpus=cpus, algorithm="dqn"
-    )
-    assert found.number <= by_number.number
+    machine, most = Machine(num_cpus, memory_bytes=16e9), int(num_cpus // cpus)
+    fit, _ = lowered_by_memory(machine, num_bytes, most, cpus=cpus, algorithm="dqn")
+    number, notes = lowered_by_memory(machine, num_bytes, most, cpus=cpus, algorithm="dqn", by_cpus=True)
+    assert (number == most) == (fit == most)
+    if number == most:
+        return
+    each = cpus_that_hold(machine, number)
+    assert number == num_cpus // each <= fit
     # With one CPU fewer for each, more would run than fit.
-    assert found.cpus == cpus or num_cpus // (found.cpus - 1) > by_number.number
-    assert not found.notes or found.notes[0].startswith((f"{found.number} trial", "Trials run one at a time"))
+    assert each == 1 or num_cpus // (each - 1) > fit
+    assert notes[0].startswith((f"{number} trial", "Trials run one at a time"))
 
 
 def test_on_a_cluster_the_setting_is_named_that_such_a_scheduler_takes() -> None:
-    (note,) = lowered(5e9, nodes=((16.0, 0.0),)).notes
+    machine = Machine(16, memory_bytes=16e9, nodes=((16.0, 0.0),))
+    _, (note,) = lowered_by_memory(machine, 5e9, 16, cpus=1, algorithm="dqn", by_cpus=True)
     assert "set resources.num_cpus; hyperparams.replay_capacity is what lowers it." in note
     # Which can be set.
     planned(PIXELS, 64e9, scheduler="pbt", resources={"num_cpus": 2})

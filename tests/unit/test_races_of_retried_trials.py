@@ -49,7 +49,7 @@ class Sweep:
 
     def go_on(self, most: int = 100) -> list[int]:
         """Have the rounds that are left, or so many of them; return of each how many of its race were over before."""
-        over = []
+        over: list[int] = []
         while len(over) < most and (following := self.next_round())[0]:
             self.rounds.append(following[0])
             over.append(following[1])

@@ -30,7 +30,7 @@ from tune_jobs.plan.env_notes import env_notes
 from tune_jobs.plan.estimates import max_disk_bytes, max_env_steps, trial_bytes
 from tune_jobs.plan.idle_notes import idle_notes
 from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.memory import lowered_by_memory
+from tune_jobs.plan.memory import cpus_that_hold, lowered_by_memory
 from tune_jobs.plan.pack_plan import TrialToPack, plan_packs
 from tune_jobs.plan.points import (
     num_points_of,
@@ -206,15 +206,12 @@ def make_plan(
     memory = _largest(sizes, specs, lambda _, each: trial_bytes(env, each))
     members = _members(to_run, points, memory)
     alone = max((memory[trial.point_index] for trial in to_run if not _is_packed(trial)), default=0)
-    at_once = lowered_by_memory(
-        machine,
-        alone,
-        concurrent,
-        cpus=spec.cpus_per_trial,
-        algorithm=spec.algorithm,
-        by_cpus=spec.scheduler.waits_for_others,
+    cpus, waits, most = spec.cpus_per_trial, spec.scheduler.waits_for_others, concurrent
+    concurrent, memory_notes = lowered_by_memory(
+        machine, alone, concurrent, cpus=float(cpus), algorithm=spec.algorithm, by_cpus=waits
     )
-    concurrent = at_once.number
+    cpus = max(cpus, cpus_that_hold(machine, concurrent)) if waits and concurrent < most else cpus
+    at_once = concurrent
     packs = plan_packs(spec, machine, members, may_spread=len(members) == len(to_run)) if members else None
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
@@ -223,10 +220,10 @@ def make_plan(
     return SweepPlan(
         trials=trials,
         num_points=len(points),
-        cpus_per_trial=at_once.cpus,
+        cpus_per_trial=cpus,
         gpus_per_trial=spec.resources.num_gpus,
         max_concurrent=concurrent,
-        max_concurrent_alone=at_once.number,
+        max_concurrent_alone=at_once,
         evaluation_seeds=evaluation_seeds(spec.seed, spec.evaluation.num_episodes),
         confirmation_seeds=confirmation_seeds(spec.seed, NUM_CONFIRMATION_EPISODES),
         max_env_steps=_total(trials, lengths),
@@ -241,7 +238,7 @@ def make_plan(
             *comparison_notes(spec, ((own, each) for own, values in zip(specs, sizes, strict=True) for each in values)),
             *idle,
             *engine_notes,
-            *at_once.notes,
+            *memory_notes,
             *outside_notes(spec, chosen_points),
             *repeated_notes(chosen_points, searched),
             *prior_notes(spec, prior),

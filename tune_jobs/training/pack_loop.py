@@ -207,7 +207,8 @@ class PackLoop:
             self._attempt(acts, saves=stop, leaves=stop)
             if not self._members:
                 return False
-            trained = [member for member in self._all if not member.waits]
+            # One that has failed is closed, and opened again before the next iteration.
+            trained = [member for member in self._all if member.loop is not None and not member.waits]
             if not trained:
                 return False
             results = self._engine.train_iteration({member.task.trial_id for member in self._all if member.waits})

@@ -75,7 +75,7 @@ class PackedEngine:
                     before = (task.num_env_steps - member.num_env_steps, task.num_iterations - member.num_iterations)
                 # Other seeds than at the trial's start, because its environments begin new episodes.
                 env_seed = random_streams.member_env_seed_after(task.seed, before[1] + member.num_iterations)
-            member.failure_penalty = task.failure_penalty
+            member.failure_penalty, member.atari_training = task.failure_penalty, task.atari_training
             stack.add(member, env_seed)
         except BaseException:
             if is_new:

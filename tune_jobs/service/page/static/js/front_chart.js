@@ -53,14 +53,16 @@ export class FrontChart {
   // `view` is the service's answer; `firstTrials` are the ids of the points' first trials, and `points` their values, by point.
   show(view, { points, firstTrials }) {
     const { front, others } = view;
-    const costs = [...others, ...front.undecided, ...front.points].map((item) => item.num_env_steps);
+    // All of it, of which the table has the cheapest.
+    const whole = [...front.points, ...view.more_on_front];
+    const costs = [...others, ...front.undecided, ...whole].map((item) => item.num_env_steps);
     this.isLog = view.costs_lie_far_apart && Math.min(...costs) > 0;
     const near = front.cheapest_near.point_index;
     const kindOf = (item, kind) => (item.rank === 1 ? "best" : item.point_index === near ? "near" : kind);
     const dots = [
       ...others.map((item) => this.dot(item, "other")),
       ...front.undecided.map((item) => this.dot(item, kindOf(item, "undecided"))),
-      ...front.points.map((item) => this.dot(item, kindOf(item, "front"))),
+      ...whole.map((item) => this.dot(item, kindOf(item, "front"))),
     ];
     for (const dot of dots) {
       dot.id = firstTrials.get(dot.item.point_index) ?? null;
@@ -72,13 +74,13 @@ export class FrontChart {
     const xs = this.dots.map((dot) => dot.x);
     const ys = this.dots.map((dot) => dot.y);
     const [low, high] = [Math.min(...xs), Math.max(...xs)];
-    const on = front.points.map((item) => this.dot(item, "front"));
+    const on = whole.map((item) => this.dot(item, "front"));
     // Drawn on to the greatest cost, as more is not to be had for more.
     this.line = { x: [...on.map((dot) => dot.x), high], y: [...on.map((dot) => dot.y), on.at(-1).y] };
     const x = this.isLog ? withAir(low, high) : [0, high * 1.03 || 1];
     this.plot.setRange({ x, y: withAir(Math.min(...ys), Math.max(...ys)) });
-    const ends = `from ${told(front.points[0])} to ${told(front.points.at(-1))}`;
-    const listed = front.points.length === 1 ? `: ${told(front.points[0])}` : ` ${ends}`;
+    const ends = `from ${told(whole[0])} to ${told(whole.at(-1))}`;
+    const listed = whole.length === 1 ? `: ${told(whole[0])}` : ` ${ends}`;
     this.plot.describe(
       `Score against cost of ${counted(view.num_settings, "setting")}; on the front ${counted(front.num_on_front, "setting")}${listed}.`,
     );

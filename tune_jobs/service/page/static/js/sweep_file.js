@@ -161,12 +161,15 @@ function someFront(value, place) {
   return found;
 }
 
+const otherSettings = is.listOf(
+  is.object({ rank: is.count, point_index: is.count, expected: is.number, num_env_steps: cost }),
+);
 const front = is.object({
   num_settings: is.count,
   front: maybe(someFront),
-  others: is.listOf(
-    is.object({ rank: is.count, point_index: is.count, expected: is.number, num_env_steps: cost }),
-  ),
+  // The files of older versions have none.
+  more_on_front: maybe(otherSettings, []),
+  others: otherSettings,
   costs_lie_far_apart: is.flag,
   cheapest_near: is.text,
   about: names,
