@@ -296,6 +296,22 @@ def has_ended(follower: Follower, within_s: float) -> bool:
     return follower.log.has_ended
 
 
+def test_it_may_be_joined_at_each_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    follower = Follower("it", Slow(0.0), EventLog("s"))
+
+    class Thread(threading.Thread):
+        def start(self) -> None:
+            # As another thread does that closes all just now.
+            follower.end()
+            follower.join()
+            super().start()
+
+    monkeypatch.setattr(threading, "Thread", Thread)
+    follower.begin()
+    follower.join()
+    assert has_ended(follower, 5.0)
+
+
 def test_what_was_looked_at_for_longer_than_one_lingers_is_followed_yet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watching, "LINGER_S", 0.5)
     follower = Follower("it", Slow(1.0), EventLog("s"))

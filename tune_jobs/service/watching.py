@@ -66,8 +66,10 @@ class Follower:
                     self.log.add(self._view.changes())
                 # The first look at a large sweep may take longer than one lingers.
                 self.used_at = time.monotonic()
-                self._thread = threading.Thread(target=self._run, name=f"watch {self._what}", daemon=True)
-                self._thread.start()
+                thread = threading.Thread(target=self._run, name=f"watch {self._what}", daemon=True)
+                # Another thread, which closes all, may join it as soon as it is known.
+                thread.start()
+                self._thread = thread
 
     def end(self) -> None:
         """Let the thread and the log end; may be called more than once."""
