@@ -1,5 +1,6 @@
 """Signals and threads while a sweep runs: who is asked, what raises, and that one process runs one sweep at a time."""
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -7,13 +8,20 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from signal import Signals
+from typing import Any
 
 import pytest
+from sweep_folders import MACHINE, make_sweep_folder
 
 from analysis.records import SweepRecord
+from policies.errors import CannotRunError
 from tests.narrowing import present
+from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.process.interruption import can_drive, current, taking_signals
+from tune_jobs.spec.file import stored_spec
+from tune_jobs.sweeps import drive
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.interrupted import SweepInterrupted
 from tune_jobs.sweeps.outcome import SweepResult
@@ -53,6 +61,30 @@ def test_a_signal_raises_where_nobody_is_asked(number: Signals) -> None:
         with pytest.raises(KeyboardInterrupt):
             send(number)
         assert interruption.came
+
+
+@pytest.mark.parametrize("comes", [True, False])
+def test_ray_that_does_not_start_after_a_signal_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, comes: bool
+) -> None:
+    store = make_sweep_folder(tmp_path / "mine")
+    trial = store.trial("t0001")
+    trial.write_record(trial.read_record().model_copy(update={"status": "pending"}))
+    plan = make_plan(stored_spec(store.read_record()), MACHINE)
+
+    def connected(*_: Any, **__: Any) -> Any:
+        if comes:
+            send(signal.SIGTERM)
+        raise CannotRunError("Ray cannot be started on this machine: it timed out.", "Look at its logs.")
+
+    monkeypatch.setattr(drive, "connected", connected)
+    failure = contextlib.nullcontext() if comes else pytest.raises(CannotRunError, match="it timed out")
+    with taking_signals() as interruption, store.lock(), drive.settled(store), failure:
+        with drive.Shared() as shared:
+            result = drive.run_trials_of(store, plan, shared, address=None, machine=MACHINE, progress="none")
+        assert result.interrupted
+    assert interruption.came == comes
+    assert store.read_record().state == "interrupted"
 
 
 @pytest.mark.parametrize("number", SIGNALS)

@@ -303,7 +303,13 @@ def _run_trials(
 
         with current().asking(ask):
             if shared.connection is None:
-                shared.connection = stack.enter_context(connected(address, machine, packs=plan.packs is not None))
+                try:
+                    shared.connection = stack.enter_context(connected(address, machine, packs=plan.packs is not None))
+                except CannotRunError:
+                    # A signal that ends Ray's processes as they start is no failure of Ray's, either.
+                    if current().came:
+                        raise KeyboardInterrupt from None
+                    raise
             from tune_jobs.ray_tune.run_trials import RunJob, run_trials
 
             most = plan.max_concurrent_alone
