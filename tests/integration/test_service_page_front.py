@@ -39,6 +39,25 @@ def store(live: Live) -> SweepStore:
     return write_sweep(live.storage, made, created_at=time.time() - 60, spec=COST | {"space": space})
 
 
+def test_a_front_of_which_some_are_listed_is_drawn_whole(
+    page: Page, live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_sweep(name="cut", points=[{"lr": 10.0 ** -(2 + index / 2)} for index in range(6)], seeds_per_point=3)
+    spec = COST | {"space": {"lr": {"loguniform": [1e-5, 1e-1]}}}
+    store = write_sweep(live.storage, made, created_at=time.time() - 60, spec=spec)
+    whole = front_view_of(store).front
+    assert whole is not None
+    assert len(whole.points) > 1
+    monkeypatch.setattr("analysis.front._NUM_LISTED", 1)
+    page.open("#/sweeps/cut")
+    page.says(".front", "The cheapest near the best:")
+    assert len(page.run(CELLS)) == 1 + len(whole.undecided)
+    drawn = str(page.one(".front .plot").get_attribute("aria-label"))
+    dearest = f"for {round(whole.points[-1].num_env_steps):,} env steps"
+    assert f"on the front {len(whole.points)} settings from " in drawn
+    assert drawn.removesuffix(".").endswith(dearest), drawn
+
+
 def test_the_front_is_drawn_and_listed(page: Page, store: SweepStore) -> None:
     front = front_view_of(store).front
     assert front is not None

@@ -201,6 +201,18 @@ def kept(*values: float) -> dict[str, Any]:
     return {"date": "2026-11-23", "machine": "a machine", "runs": runs}
 
 
+def test_ranks_leave_out_a_task_that_a_method_has_run_less_often() -> None:
+    found = {
+        ("cartpole-dqn", "random"): kept(1, 2), ("cartpole-dqn", "pbt"): kept(5, 1),
+        ("acrobot-dqn", "random"): kept(1, 2), ("acrobot-dqn", "pbt"): kept(5),
+    }  # fmt: skip
+    lines = list(tables(found))
+    assert "| acrobot-dqn | 1.5 ± 6.4 (of 2) | 5.0 (of 1) |" in "\n".join(lines)
+    assert [line for line in lines if line.startswith("Mean rank")] == [
+        "Mean rank of 2 over 1 task, while tuning: random 1.50, pbt 1.50; on test seeds: random 1.50, pbt 1.50."
+    ]
+
+
 def test_the_default_is_ranked_beside_random_draws_wherever_both_were_run() -> None:
     found = {("cartpole-dqn", "random"): kept(1, 2), ("cartpole-dqn", "gp"): kept(5, 1)}
     text = "\n".join(tables({**found, ("acrobot-dqn", "gp"): kept(5, 5), ("acrobot-dqn", "tpe"): kept(5, 5)}))

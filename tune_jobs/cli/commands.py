@@ -107,7 +107,7 @@ def launch(
             if server_of() is None:
                 from tune_jobs.sweeps.dry_run import planned
 
-                where = {name: options[name] for name in ("address", "wait_for_nodes")}
+                where = {option: options[option] for option in ("address", "wait_for_nodes")}
                 loaded, plan = planned(spec, overrides, name=name, storage=storage, **where)
             else:
                 loaded, plan = verbs().planned(spec, overrides, name=name)

@@ -46,7 +46,7 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
         trials, results = read_trials(store), read_results(store)
 
     def ranked_of(known: Sequence[TrialRecord]) -> list[SettingScores]:
-        return list(ranked(spec, known, results, threshold))
+        return ranked(spec, known, results, threshold)
 
     race, before, num_done = race_under_way(spec, trials, rounds, ranked_of)
     if race is None or are_all_alike([line for trial in before for line in results.get(trial.trial_id, ())]):

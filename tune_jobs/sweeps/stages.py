@@ -142,8 +142,7 @@ def _what_is_left_out(store: Sweep) -> tuple[str, ...]:
         return ()
     command = resume_command(store, store.read_record())
     settings = len(set(wanted))
-    leading = "the leading setting" if settings == 1 else f"the {settings} leading settings"
-    told = f"{leading} got no more seeds (confirm), as nothing was to follow the trials"
+    told = f"the {settings} leading settings got no more seeds (confirm), as nothing was to follow the trials"
     return (f"{told}: `{command}` does both.",) if wanted else ()
 
 

@@ -78,8 +78,13 @@ _BOTH = {"score": "while tuning", "test": "on test seeds"}
 
 
 def _ranks(kept: Kept, tasks: list[str], methods: Sequence[str], by: Mapping[str, str] = _BOTH) -> Iterator[str]:
-    """Yield mean ranks over the tasks that all methods have run, each run compared with those of its number."""
-    whole = [task for task in tasks if all(kept.get((task, method)) for method in methods)]
+    """Yield mean ranks over the tasks that all methods have run equally often, each run compared with its number's."""
+
+    def num_runs(task: str) -> set[int]:
+        return {len(found["runs"]) if (found := kept.get((task, method))) else 0 for method in methods}
+
+    # One run beside five would count as much as all of theirs.
+    whole = [task for task in tasks if len(num_runs(task)) == 1 and 0 not in num_runs(task)]
     if not whole or len(methods) < 2:
         return
     told = []
@@ -87,9 +92,7 @@ def _ranks(kept: Kept, tasks: list[str], methods: Sequence[str], by: Mapping[str
         ranks = []
         for task in whole:
             rows = [values_of(found, what) for method in methods if (found := kept[task, method])]
-            num_runs = min(map(len, rows))
-            columns = np.array([row[:num_runs] for row in rows])
-            ranks.append(stats.rankdata(-columns, axis=0).mean(axis=1))
+            ranks.append(stats.rankdata(-np.array(rows), axis=0).mean(axis=1))
         means = np.mean(ranks, axis=0)
         named = ", ".join(f"{method} {mean:.2f}" for method, mean in zip(methods, means, strict=True))
         told.append(f"{words}: {named}")
