@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 from fake_sweeps import run, sweeps
+from sweep_folders import sweep_template
 
 if TYPE_CHECKING:
     from live_service import Live
     from page_browser import Page
     from selenium import webdriver
 
-__all__ = ["browser", "live", "page", "run", "sweeps"]
+__all__ = ["browser", "live", "page", "run", "sweep_template", "sweeps"]
 
 
 # Selenium may be missing: then the files that need it are skipped, and the others are not.

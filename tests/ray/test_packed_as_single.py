@@ -15,7 +15,7 @@ from analysis.records import TrialRecord
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import CopyFrom, Standing
 
-pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("nothing_is_synced")]
+pytestmark = pytest.mark.ray
 
 
 class FakedTune:

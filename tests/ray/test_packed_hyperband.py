@@ -13,7 +13,7 @@ from meeting_packs import Packs, random_scores
 from tune_jobs.ray_tune.hyperband import HyperBand
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
 
-pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("nothing_is_synced")]
+pytestmark = pytest.mark.ray
 
 BAND: dict[str, Any] = {"type": "hyperband", "grace_env_steps": 200, "reduction_factor": 2.0}
 

@@ -18,7 +18,7 @@ from tune_jobs.search.gains import Evaluations, gains_of
 from tune_jobs.store.trial_store import TrialStore
 from tune_jobs.training.pack_loop import MemberReport
 
-pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("nothing_is_synced")]
+pytestmark = pytest.mark.ray
 
 
 # -- when, and who

@@ -11,7 +11,7 @@ from meeting_packs import Packs, Score, random_scores
 from analysis.records import ChangeRecord
 from analysis.tables import describe_changes
 
-pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("nothing_is_synced")]
+pytestmark = pytest.mark.ray
 
 MF: dict[str, Any] = {"type": "pbt", "perturb_every_env_steps": 200, "frequencies": [1, 2]}
 """With evaluations every 200 env steps, to 1,000: the faster one selects at 200, 400, 600 and 800, the slower at 400

@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import functools
 import io
 import keyword
 import re
@@ -51,8 +52,12 @@ BLOCK = re.compile(r"```.*?```", re.DOTALL)
 ENDINGS = {"py", "yaml", "json", "jsonl", "log", "txt", "csv", "safetensors", "html", "mp4", "gif", "damaged"}
 
 
-def strings_and_names() -> tuple[set[str], list[tuple[str, str]]]:
-    """All texts of the code that a reader sees, by place; and every word that the code itself consists of."""
+@functools.cache
+def names_and_texts() -> tuple[set[str], list[tuple[str, str]]]:
+    """Every word that the code itself consists of; and all texts of it that a reader sees, by place.
+
+    For whoever asks first: each process of a run collects all tests, and reading the code takes seconds.
+    """
     names, texts = set(dir(builtins)) | set(keyword.kwlist), []
     for path in [*CODE, *TESTS]:
         own = path in CODE
@@ -83,6 +88,14 @@ def strings_and_names() -> tuple[set[str], list[tuple[str, str]]]:
     return names, texts
 
 
+def all_names() -> set[str]:
+    return names_and_texts()[0]
+
+
+def all_texts() -> list[tuple[str, str]]:
+    return names_and_texts()[1]
+
+
 def names_in(node: Any) -> set[str]:
     match node:
         case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=name):
@@ -101,7 +114,6 @@ SECTIONS = {
     for name, field in SweepSpec.model_fields.items()
     if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
 }
-NAMES, TEXTS = strings_and_names()
 
 
 def defined() -> dict[str, set[str]]:
@@ -144,11 +156,11 @@ def quoted(text: str) -> Iterator[str]:
 def test_every_word_in_backticks_is_one_of_the_code() -> None:
     missing = {
         f"{place}: `{reference}`"
-        for place, text in TEXTS
+        for place, text in all_texts()
         if not place.startswith(DECISIONS)
         for reference in quoted(text)
         for word in re.findall(r"[A-Za-z_]\w*", reference)
-        if word not in NAMES and word not in ELSEWHERE
+        if word not in all_names() and word not in ELSEWHERE
     }
     assert missing == set()
 
@@ -160,7 +172,7 @@ def test_every_dotted_name_of_ours_leads_somewhere() -> None:
         if "." in name:
             by_stem.setdefault(name.rpartition(".")[2], set()).update(names)
     missing = set()
-    for place, text in TEXTS:
+    for place, text in all_texts():
         for reference in quoted(text) if not place.startswith(DECISIONS) else ():
             match = re.fullmatch(r"((?:\w+\.)+)(\w+)(\(.*\))?", reference)
             if match is None:
@@ -181,7 +193,7 @@ def test_every_file_that_is_named_is_there() -> None:
     pattern = re.compile(r"(?<![\w/.<>-])((?:docs|tests|policies|analysis|tune_jobs|docker)/[\w./-]*\w)")
     missing = {
         f"{place}: {name}"
-        for place, text in [*TEXTS, ("Makefile", (ROOT / "Makefile").read_text())]
+        for place, text in [*all_texts(), ("Makefile", (ROOT / "Makefile").read_text())]
         for name in pattern.findall(text)
         if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()
     }
@@ -191,7 +203,7 @@ def test_every_file_that_is_named_is_there() -> None:
 def test_every_command_with_its_options_exists() -> None:
     pattern = re.compile(r"(^ *(?:\$ )?|[`\"' ]|bin/)tune-jobs ([a-z]+)\b([^`\n\"]*)", re.MULTILINE)
     wrong = set()
-    for place, text in [*TEXTS, *((str(path.name), path.read_text()) for path in CODE)]:
+    for place, text in [*all_texts(), *((str(path.name), path.read_text()) for path in CODE)]:
         for before, name, rest in pattern.findall(text):
             command = cli.commands.get(name)
             if command is None:
@@ -217,7 +229,7 @@ def test_every_target_of_make_exists_and_is_given_none_of_a_programs_options() -
     # As code in a line, or at the beginning of a line of a block.
     pattern = re.compile(r"(?:`|^(?:\$ )?|&& )make ([^`\n#&]+)", re.MULTILINE)
     pages = [*DOCUMENTS, *(ROOT / name for name in ("CONTRIBUTING.md", "docker/README.md"))]
-    texts = [*TEXTS, *((str(path.relative_to(ROOT)), path.read_text()) for path in pages)]
+    texts = [*all_texts(), *((str(path.relative_to(ROOT)), path.read_text()) for path in pages)]
     found = {
         (place, line.strip())
         for place, text in texts
@@ -278,7 +290,7 @@ def test_every_key_of_a_sweep_file_that_is_named_is_one() -> None:
     allowed = {"json", "items", "py", "values", "hiden_sizes"}
     wrong = {
         f"{place}: {section}.{name}"
-        for place, text in TEXTS
+        for place, text in all_texts()
         for section, name in pattern.findall(text)
         if name not in known[section] | allowed
     }
