@@ -36,7 +36,13 @@ class Queue:
         wait_until(lambda: self.live.service.watching.num_watchers > 0)
 
     def finish(
-        self, name: str, outcome: Any = "completed", message: str | None = None, until: Any = lambda: True
+        self,
+        name: str,
+        outcome: Any = "completed",
+        message: str | None = None,
+        until: Any = lambda: True,
+        *,
+        finish_failed: bool | None = None,
     ) -> None:
         number = self.wait_for_job()
         self.watched()
@@ -46,7 +52,7 @@ class Queue:
         if outcome == "completed" and not store.has_best():
             record = store.read_record()
             store.write_record(record.model_copy(update={"state": "completed"}))
-        self.jobs.end(number, outcome, message)
+        self.jobs.end(number, outcome, message, finish_failed=finish_failed)
 
 
 def during(what: Any) -> threading.Thread:
@@ -104,6 +110,23 @@ def test_a_resumed_sweep_ends_with_the_result_of_one_that_runs_here(run: RunComm
     assert document["artifacts"].keys() == {
         "policy", "before_mp4", "after_mp4", "after_gif", "before_after_mp4", "report",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("finish_failed", "code"), [(True, 3), (False, 0), (None, 0)])
+def test_a_film_that_failed_there_is_told_as_one_that_failed_here(
+    run: RunCommand, live: Live, finish_failed: bool | None, code: int
+) -> None:
+    """Nobody knows it of a job that an older version ran."""
+    make_finished(live.storage / "mine")
+    told = Queue(live)
+    worker = during(lambda: told.finish("mine", message="It has no film.", finish_failed=finish_failed))
+    result = run("--server", live.url, "resume", "mine", "--json", "--progress", "none")
+    worker.join(30)
+    assert result.exit_code == code, result.output
+    document = json.loads(result.stdout)
+    assert (document["exit_code"], document["finish_failed"]) == (code, code == 3)
+    assert document["best"]["checkpoint"]["trial_id"] == "t0003"
+    assert document["notes"] == ["It has no film."]
 
 
 def test_a_policy_of_before_is_not_the_result_of_an_extension(run: RunCommand, live: Live) -> None:

@@ -267,6 +267,19 @@ def test_a_database_is_opened_again(database_url: str) -> None:  # noqa: F811
     engine.dispose()
 
 
+def test_the_jobs_of_an_older_version_are_kept(database_url: str) -> None:  # noqa: F811
+    engine = open_database(database_url)
+    job = add(Queue(engine), "a")
+    with engine.begin() as connection:
+        connection.execute(text("ALTER TABLE jobs DROP COLUMN finish_failed"))
+        connection.execute(text("UPDATE alembic_version SET version_num = '0002'"))
+    engine.dispose()
+    engine = open_database(database_url)
+    assert Queue(engine).jobs() == [job]
+    assert Queue(engine).end(job.id, "completed", finish_failed=True).finish_failed is True
+    engine.dispose()
+
+
 def test_a_newer_database_is_refused(engine: Engine, database_url: str) -> None:  # noqa: F811
     with engine.begin() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))

@@ -1,4 +1,4 @@
-"""Jobs that can't be started: the disk of their files or of the queue is full, or something is in the way."""
+"""Jobs that can't be started, as a disk is full or something is in the way; and what is kept of those that end."""
 
 import errno
 import os
@@ -71,3 +71,12 @@ def test_a_sweep_whose_own_files_can_not_be_written_fails_and_keeps_no_other_fro
     assert "Check the storage folder." in told
     assert (other.outcome, other.num_attempts) == ("completed", 1)
     assert place.begins("a") == []
+
+
+def test_whether_what_follows_the_trials_failed_is_kept(place: Place, service: Supervisor) -> None:
+    for name, how in (("whole", {}), ("no film", {"finish_failed": True}), ("broken", {"error": "it broke"})):
+        place.submit(name, **how)
+    service.start()
+    ended = [(job.sweep, job.finish_failed) for job in place.until_all_end()]
+    assert ended == [("whole", False), ("no film", True), ("broken", None)]
+    assert sorted((job.sweep, job.finish_failed) for job in place.ended) == sorted(ended)

@@ -181,6 +181,7 @@ def _result(client: Client, job: Job) -> dict[str, Any]:
     files = {file.path for file in client.files(name)} if is_whole else set()
     at = f"{client.url}/api/v1/sweeps/{quote(name)}"
     has_failed = any(trial.status == "failed" for trial in trials)
+    finish_failed = is_whole and (best is None or bool(job.finish_failed))
     return {
         "folder": f"{client.url}/#/sweeps/{quote(name)}",
         "sweep": client.status(name).sweep,
@@ -192,8 +193,8 @@ def _result(client: Client, job: Job) -> dict[str, Any]:
         },
         "interrupted": not is_whole,
         "notes": [job.message] if is_whole and best is not None and job.message else [],
-        "finish_failed": is_whole and best is None,
-        "exit_code": INTERRUPTED if not is_whole else 3 if has_failed or best is None else 0,
+        "finish_failed": finish_failed,
+        "exit_code": INTERRUPTED if not is_whole else 3 if has_failed or finish_failed else 0,
     }
 
 

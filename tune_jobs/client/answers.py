@@ -32,6 +32,11 @@ class Job(_Answer):
     state: str = Field(description="creating, waiting, running or ended.")
     outcome: str | None = Field(description="completed, failed, stopped or cancelled; None: it has not ended.")
     message: str | None = Field(description="Why it failed.")
+    finish_failed: bool | None = Field(
+        default=None,
+        description="Whether the choice of a policy, its video or the report failed; None: it has not completed, or an "
+        "older service doesn't say.",
+    )
     num_attempts: int
     stop_requested: bool
     submitted_at: float

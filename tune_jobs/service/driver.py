@@ -144,7 +144,8 @@ def _ended(request: Mapping[str, Any]) -> Ended:
         return Ended(attempt=attempt, outcome="stopped")
     failed = [trial for trial in result.trials if trial.status == "failed"]
     told = [f"{len(failed)} of {len(result.trials)} trials failed."] if failed else []
-    return Ended(attempt=attempt, outcome="completed", message=" ".join([*told, *result.notes]) or None)
+    message = " ".join([*told, *result.notes]) or None
+    return Ended(attempt=attempt, outcome="completed", message=message, finish_failed=result.finish_failed)
 
 
 def _done(request: Mapping[str, Any]) -> Any:

@@ -44,6 +44,8 @@ class Ended(BaseModel):
     outcome: Literal["completed", "failed", "stopped", "interrupted"]
     """Stopped: somebody asked the sweep to stop. Interrupted: a signal came, such as when the service is drained."""
     message: str | None = None
+    finish_failed: bool | None = None
+    """Whether what follows the trials failed; None: they did not come to their end."""
 
 
 class Holder(BaseModel):

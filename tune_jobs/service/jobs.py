@@ -32,6 +32,10 @@ class Job(BaseModel):
     state: JobState = Field(description="Where it is; creating: its sweep is being written.")
     outcome: Outcome | None = Field(description="How it ended; null: it has not.")
     message: str | None = Field(description="Why it failed.")
+    finish_failed: bool | None = Field(
+        description="Whether the choice of a policy, its video or the report failed after the trials; null: it has not "
+        "completed, or an older version ran it."
+    )
     num_attempts: int = Field(description="How many driver processes were started for it.")
     stop_requested: bool = Field(description="Whether somebody asked for its end.")
     submitted_at: float

@@ -189,10 +189,21 @@ class Queue:
         """Let a running job wait again, as the service is drained."""
         return self._change(job_id, {"state": "waiting", "stop_requested": False}, ("running",))
 
-    def end(self, job_id: int, outcome: Outcome, message: str | None = None, *, at: float | None = None) -> Job:
+    def end(
+        self,
+        job_id: int,
+        outcome: Outcome,
+        message: str | None = None,
+        *,
+        finish_failed: bool | None = None,
+        at: float | None = None,
+    ) -> Job:
         """End a job that waits or runs, at a time in seconds since 1970; None: now."""
         ended_at = self._now() if at is None else at
-        values = {"state": "ended", "outcome": outcome, "message": message, "ended_at": ended_at}
+        values = {
+            "state": "ended", "outcome": outcome, "message": message, "finish_failed": finish_failed,
+            "ended_at": ended_at,
+        }  # fmt: skip
         return self._change(job_id, values, ("waiting", "running"))
 
     # -- what people change

@@ -242,7 +242,7 @@ class Supervisor:
             return
         ended = files.read_ended(job.num_attempts)
         if ended is not None and ended.outcome != "interrupted":
-            self._finish(job, ended.outcome, ended.message)
+            self._finish(job, ended.outcome, ended.message, finish_failed=ended.finish_failed)
         elif job.stop_requested:
             self._finish(job, "stopped")
         elif ended is not None or self._draining.is_set():
@@ -287,14 +287,15 @@ class Supervisor:
             # Not SIGTERM, as systemd may have sent that to all: a second one would end the trials before they save.
             os.kill(holder.pid, signal.SIGHUP)
 
-    def _finish(self, job: Job, outcome: Outcome, message: str | None = None) -> None:
+    def _finish(
+        self, job: Job, outcome: Outcome, message: str | None = None, *, finish_failed: bool | None = None
+    ) -> None:
         # First it is told: whoever is killed in between tells it twice, and not never.
         now = time.time()
-        ended = {"state": "ended", "outcome": outcome, "message": message, "ended_at": now}
-        self._on_end(job.model_copy(update=ended))
-        self._queue.end(job.id, outcome, message, at=now)
-        told = (job.id, job.verb, job.sweep, outcome)
-        _log.info("Job %d (%s of sweep %s) has ended: %s.", *told, extra=job.log_fields)
+        said = {"outcome": outcome, "message": message, "finish_failed": finish_failed}
+        self._on_end(job.model_copy(update=said | {"state": "ended", "ended_at": now}))
+        self._queue.end(job.id, outcome, message, at=now, finish_failed=finish_failed)
+        _log.info("Job %d (%s of sweep %s) has ended: %s.", job.id, job.verb, job.sweep, outcome, extra=job.log_fields)
         self._not_started.pop(job.id, None)
         # All that they said is in the queue now.
         if outcome != "failed":

@@ -38,6 +38,7 @@ jobs = Table(
     Column("state", String(20), nullable=False),
     Column("outcome", String(20)),
     Column("message", Text),
+    Column("finish_failed", Boolean),
     Column("num_attempts", Integer, nullable=False),
     Column("stop_requested", Boolean, nullable=False),
     Column("submitted_at", Float, nullable=False),
