@@ -86,7 +86,7 @@ test-slow: $(VENV)/installed-test
 	TUNE_JOBS_SLOW=only $(PYTEST)
 
 unit: $(VENV)/installed-test
-	$(BIN)/python -m pytest --quiet --numprocesses=2 tests/unit
+	$(BIN)/python -m pytest --quiet --numprocesses=3 tests/unit
 
 lint: $(VENV)/installed-test
 	$(BIN)/ruff check .
