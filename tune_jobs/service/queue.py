@@ -198,7 +198,15 @@ class Queue:
         finish_failed: bool | None = None,
         at: float | None = None,
     ) -> Job:
-        """End a job that waits or runs, at a time in seconds since 1970; None: now."""
+        """End a job that waits or runs.
+
+        Args:
+            job_id: The job.
+            outcome: How it ended.
+            message: Why it failed, or what is to be said of what it did.
+            finish_failed: Whether what follows the trials failed; None: they did not come to their end.
+            at: When, in seconds since 1970; None: now.
+        """
         ended_at = self._now() if at is None else at
         values = {
             "state": "ended", "outcome": outcome, "message": message, "finish_failed": finish_failed,
