@@ -20,7 +20,7 @@ from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import FORBIDDEN
 from policies.envs.own_actions import Choices
-from policies.envs.rendering import draw_without_display, picture_of
+from policies.envs.rendering import draw_without_display, drawing_hint, picture_of
 from policies.errors import EnvError, said_by
 
 ScoreKind = Literal["probabilities", "values", "advantages", "gaussian"]
@@ -158,7 +158,7 @@ def _picture(env: gym.Env[Any, Any]) -> str | None:
     except Exception as error:  # an env may raise anything
         env_id = env.spec.id if env.spec is not None else "The env"
         raise EnvError(
-            f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.", "Mend its render()."
+            f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.", drawing_hint(error)
         ) from error
     if frame is None:
         return None

@@ -23,7 +23,7 @@ from policies.acting.movies import GifWriter, Mp4Writer, enlarged, fitted
 from policies.acting.policy import Policy
 from policies.envs.faults import close_env
 from policies.envs.make import make_env
-from policies.envs.rendering import display_hint, draw_without_display, picture_of
+from policies.envs.rendering import draw_without_display, drawing_hint, picture_of
 from policies.errors import EnvError, SpecError, said_by
 
 MAX_ENDLESS_STEPS = 3_000
@@ -200,9 +200,7 @@ class _Stage:
         except Exception as error:  # an env may raise anything
             raise EnvError(
                 f"{env_id} cannot be drawn: {type(error).__name__}: {said_by(error)}.",
-                display_hint(error)
-                or "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
-                "libosmesa6).",
+                drawing_hint(error),
             ) from error
         if frame is None:
             raise EnvError(

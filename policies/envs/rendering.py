@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.util import find_spec
@@ -28,6 +29,10 @@ _CHOOSES_WHEN_IMPORTED = "dm_control"
 """A package that draws with MuJoCo's backends, by the variable's value when it is imported."""
 _DISPLAY = re.compile("(?i:display)(?![_a-z])")
 """In the name or the words of an error; no part of another word, as in display_mode."""
+_GRAPHICS = re.compile("(?i:opengl|(?<![a-z])egl|osmesa|glx|glfw|vulkan|libgl|video device|pip install)")
+"""In the words of an error of what draws, or of what is missing to draw with."""
+_GRAPHICS_PACKAGES = frozenset({"OpenGL", "dm_control", "glfw", "mujoco", "pygame", "pyglet"})
+"""Which raise errors that say nothing of it, such as that None has no attribute."""
 _TRIAL_TIMEOUT_S = 30.0
 
 
@@ -98,6 +103,23 @@ def display_hint(error: BaseException) -> str | None:
     return (
         "It wants a display, and there is none here: `xvfb-run -a tune-jobs ...` gives it one (Debian's xvfb, xauth)."
     )
+
+
+def drawing_hint(error: BaseException) -> str:
+    """Return what to do about an error that an environment's `render()` raised."""
+    if (hint := display_hint(error)) is not None:
+        return hint
+    by = {
+        str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        for frame, _ in traceback.walk_tb(error.__traceback__)
+    }
+    told = f"{type(error).__name__} {said_by(error)}"
+    if isinstance(error, ImportError) or by & _GRAPHICS_PACKAGES or _GRAPHICS.search(told):
+        return (
+            "Install what it needs to draw without a display (for MuJoCo EGL or OSMesa: Debian's libegl1 or "
+            "libosmesa6)."
+        )
+    return "Mend its render()."
 
 
 def picture_of(drawn: Any) -> NDArray[np.uint8] | None:

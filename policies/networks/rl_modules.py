@@ -18,14 +18,14 @@ from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPP
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.learner.utils import make_target_network
 from ray.rllib.core.models.catalog import Catalog
-from ray.rllib.core.rl_module.apis import QNetAPI, TargetNetworkAPI, ValueFunctionAPI
 from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from torch import Tensor, nn
 
 from policies.errors import SpecError
-from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
+from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 from policies.networks.exploration import EpsilonGreedy
 from policies.networks.layers import Encoder, ObservationStatistics
+from policies.networks.own_modules import ASKED, check_own_module
 from policies.networks.parts import DQNNetworks, PPONetworks, model_config
 
 QF_PREDS, QF_NEXT_PREDS, QF_TARGET_NEXT_PREDS = "qf_preds", "qf_next_preds", "qf_target_next_preds"
@@ -211,31 +211,10 @@ def module_spec(hyperparams: TrainedHyperparams, rl_module: str | None = None) -
 
 def _own_class(hyperparams: TrainedHyperparams, rl_module: str) -> type[RLModule]:
     found = import_module_class(rl_module)
-    needed = [ValueFunctionAPI] if isinstance(hyperparams, PPOHyperparams) else [QNetAPI, TargetNetworkAPI]
-    for api in needed:
-        if not issubclass(found, api):
-            raise SpecError(
-                f"rl_module {rl_module!r} is not a {api.__name__}, which the algorithm needs.",
-                "Derive it from policies.networks.PPOModule for PPO, or DQNModule for DQN.",
-            )
-    if isinstance(hyperparams, DQNHyperparams):
-        if hyperparams.epsilon_schedule != "linear" and not issubclass(found, EpsilonGreedy):
-            raise SpecError(
-                f"epsilon_schedule {hyperparams.epsilon_schedule} does not reach rl_module {rl_module!r}: RLlib's own "
-                "exploration has linear schedules only.",
-                "Derive the class from policies.networks.DQNModule, or set epsilon_schedule: linear.",
-            )
-        if hyperparams.epsilon_unit != "env_step" and not issubclass(found, EpsilonGreedy):
-            raise SpecError(
-                f"epsilon_unit {hyperparams.epsilon_unit} does not reach rl_module {rl_module!r}: RLlib's own "
-                "exploration counts env steps only.",
-                "Derive the class from policies.networks.DQNModule, or set epsilon_unit: env_step.",
-            )
-        if not hyperparams.target_network and not issubclass(found, DQNModule):
-            raise SpecError(
-                f"target_network is false, but rl_module {rl_module!r} always has a target network, like RLlib's own.",
-                "Derive the class from policies.networks.DQNModule, or set target_network: true.",
-            )
+    if isinstance(hyperparams, PPOHyperparams):
+        check_own_module(rl_module, found, "ppo", {})
+    else:
+        check_own_module(rl_module, found, "dqn", {name: [getattr(hyperparams, name)] for name in ASKED})
     return found
 
 

@@ -16,7 +16,7 @@ from policies.acting.video import record_video
 from policies.envs import rendering
 from policies.envs.faults import close_env
 from policies.envs.make import check_env, make_env, make_vector_env
-from policies.envs.rendering import choose_before_import, display_hint, draw_without_display
+from policies.envs.rendering import choose_before_import, display_hint, draw_without_display, drawing_hint
 from policies.errors import EnvError
 
 VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "SDL_AUDIODRIVER", "MUJOCO_GL")
@@ -350,3 +350,35 @@ class MuteError(Exception):
 )
 def test_that_a_display_is_wanted_is_known_by_the_error_and_its_name(error: Exception, *, hinted: bool) -> None:
     assert (display_hint(error) is not None) is hinted
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (ValueError("the motor broke"), "Mend its render()"),
+        (ValueError("negligible"), "Mend its render()"),
+        (MuteError(), "Mend its render()"),
+        (RuntimeError("an OpenGL platform library has not been loaded"), "libegl1"),
+        (RuntimeError("No available video device"), "libegl1"),
+        (ImportError("cannot import name"), "libegl1"),
+        (
+            gym.error.DependencyNotInstalled('pygame is not installed, run `pip install "gymnasium[toy-text]"`'),
+            "libegl1",
+        ),
+        (OSError("X11: The DISPLAY environment variable is missing"), "xvfb-run"),
+    ],
+)
+def test_only_who_lacks_something_to_draw_with_is_told_to_install_it(error: Exception, words: str) -> None:
+    assert words in drawing_hint(error)
+
+
+def test_what_raises_an_error_is_known_by_where_it_is_raised() -> None:
+    """MuJoCo's libraries raise errors that speak of attributes where one is missing."""
+    for package, words in (("OpenGL.raw", "libegl1"), ("my_envs.opengl", "Mend its render()")):
+        caught = None
+        try:
+            exec("None.queryString", {"__name__": package})  # as it were a module of that package
+        except AttributeError as error:
+            caught = error
+        assert caught is not None
+        assert words in drawing_hint(caught)

@@ -16,6 +16,8 @@ from policies.acting.baselines import BASELINES
 from policies.envs.ids import module_of
 from policies.envs.modules import allow_modules, import_allowed, path_of
 from policies.errors import SpecError
+from policies.networks.own_modules import ASKED, check_own_module
+from tune_jobs.spec.domains import Listed
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -79,7 +81,8 @@ def check_rl_module(spec: SweepSpec) -> None:
     """Check that a sweep's RLModule may be imported and is an RLModule class.
 
     Raises:
-        SpecError: It is not allowed, not found, or not an RLModule class; or the algorithm has no network.
+        SpecError: It is not allowed, not found, not an RLModule class, or none that the algorithm can train and that
+            its hyperparameters reach; or the algorithm has no network.
     """
     if spec.rl_module is None:
         return
@@ -99,3 +102,11 @@ def check_rl_module(spec: SweepSpec) -> None:
             f"rl_module is {spec.rl_module}, which is not an RLModule class but {found!r}.",
             "Derive it from RLlib's RLModule, or from one of policies.networks.",
         )
+    check_own_module(spec.rl_module, found, spec.algorithm, {name: _asked(spec, name) for name in ASKED})
+
+
+def _asked(spec: SweepSpec, name: str) -> Sequence[Any]:
+    """Return what a sweep file asks of a hyperparameter: its values in the space, or the one that is fixed."""
+    if (domain := spec.space.get(name)) is not None:
+        return domain.values if isinstance(domain, Listed) else ()
+    return [spec.hyperparams[name]] if name in spec.hyperparams else []
