@@ -252,7 +252,7 @@ def _check_drawable(env_id: str, env_args: Mapping[str, Any] | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         plain = make_env(env_id, env_args)
-    modes = list(plain.metadata.get("render_modes") or [])
+    modes = list(map(str, plain.metadata.get("render_modes") or []))
     close_env(plain)
     if "rgb_array" not in modes:
         raise EnvError(

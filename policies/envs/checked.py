@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.byte_images import as_bytes
 from policies.envs.faults import close_env, env_failed
 from policies.envs.masks import num_masked, seen_by_networks
 from policies.envs.stacked import WithMembers
@@ -23,6 +24,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 """The largest number of 32 bits; training computes in 32 bits, where anything larger is infinite."""
 _LARGEST_32 = np.finfo(np.float32).max
 """The same number as a NumPy scalar of 32 bits; numbers of 16 bits would be compared with infinity otherwise."""
+_MEND_VECTORISED = "Mend its vector_entry_point, or register the env without one."
 _HINT = "Mend the env: training on it would ruin the weights."
 
 
@@ -153,7 +155,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         except BaseException as error:
             raise env_failed(f"{self._env_id} raised an error in reset()", error) from error
         self._lengths[:], self._ended[:] = 0, False
-        observations = self._as_array(observations, "observations", self._shape)
+        observations = self._as_observations(observations)
         self._check(observations)
         return observations, {}
 
@@ -169,7 +171,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         except BaseException as error:
             raise env_failed(f"{self._env_id} raised an error in step()", error, in_step=True) from error
         row = self._shape[:1]
-        observations = self._as_array(observations, "observations", self._shape)
+        observations = self._as_observations(observations)
         rewards = self._as_array(rewards, "rewards", row).reshape(row)
         terminated, truncated = (
             self._as_array(values, what, row).reshape(row).astype(np.bool_, copy=False)
@@ -187,6 +189,15 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         self._ended = ended
         return observations, rewards, terminated, truncated, {}
 
+    def _as_observations(self, values: Any) -> NDArray[Any]:
+        observations = self._as_array(values, "observations", self._shape)
+        if self.env.single_observation_space.dtype != np.uint8:
+            return observations
+        try:
+            return as_bytes(observations)
+        except ValueError as error:
+            raise EnvError(f"The vectorised {self._env_id} returned {error}.", _MEND_VECTORISED) from None
+
     def _as_array(self, values: Any, what: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """Return what a vectorised version returned as an array of this shape; one row may come as a column.
 
@@ -201,7 +212,7 @@ class CheckedEnvs(gym.vector.VectorWrapper):
         raise EnvError(
             f"The vectorised {self._env_id} returned {what} of shape {array.shape} and dtype {array.dtype}, not "
             f"numbers of shape {shape}.",
-            "Mend its vector_entry_point, or register the env without one.",
+            _MEND_VECTORISED,
         )
 
     def _check(self, observations: NDArray[Any]) -> None:

@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.byte_images import as_bytes
 from policies.envs.checked import is_sound, reward_as_number
 from policies.envs.faults import env_failed
 from policies.envs.flat import FlatBox, needs_flattening
@@ -227,17 +228,25 @@ def _is_bool(value: Any) -> bool:
 def _observation_problem(observation: Any, space: gym.Space[Any]) -> str | None:
     if needs_flattening(space):
         return _unflattened_problem(observation, space)
-    wanted = np.dtype(space.dtype)
     try:
         array = np.asarray(observation)
     except Exception:  # noqa: BLE001 (ragged lists, say)
         return f"{_kind(observation)} as observation, not an array of shape {space.shape}"
     if array.shape != space.shape:
         return f"observations of shape {array.shape} but declares {space.shape}"
-    # Bytes would lose the decimals of a fraction.
-    if array.dtype.kind not in ("biuf" if wanted.kind == "f" else "biu"):
-        return f"observations of dtype {array.dtype} but declares {wanted}"
+    if array.dtype.kind not in "biuf":
+        return f"observations of dtype {array.dtype} but declares {space.dtype}"
+    if space.dtype == np.uint8:
+        return _bytes_problem(array)
     return None if is_sound(array) else _not_finite(array, space)
+
+
+def _bytes_problem(array: NDArray[Any]) -> str | None:
+    try:
+        as_bytes(array)
+    except ValueError as error:
+        return str(error)
+    return None
 
 
 def _not_finite(array: NDArray[Any], space: gym.Space[Any]) -> str | None:
@@ -259,7 +268,12 @@ def _place_in(space: gym.Space[Any], number: int) -> str:
 def _unflattened_problem(observation: Any, space: gym.Space[Any]) -> str | None:
     """What is wrong with an environment's own observation, which a wrapper could not make a vector."""
     try:
-        FlatBox(space).flat(observation)
+        flat = FlatBox(space)
+    except ValueError:
+        # No vector can be made of what a wrapper leaves out: that is not the error that is looked for.
+        return None
+    try:
+        flat.flat(observation)
     except ValueError as error:
         return str(error)
     return None

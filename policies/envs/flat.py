@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from policies.envs.byte_images import ByteImages, as_bytes
 from policies.errors import shortened
 
 MAX_SIZE = 10_000_000
@@ -92,10 +93,10 @@ class FlatBox(gym.spaces.Box):
         Raises:
             ValueError: The observation is not of the space; the message says where, and fits behind "returns".
         """
-        numbers = np.zeros(self._parts[-1].end, np.float32)
+        numbers = np.zeros(self._parts[-1].end, self.dtype)
         for part in self._parts:
             _write(numbers[part.start : part.end], part, _member(observation, part.keys))
-        return numbers.reshape(self.shape).astype(self.dtype, copy=False)
+        return numbers.reshape(self.shape)
 
     def flat_or_own(self, observations: Any) -> Any:
         """Return vectors: what is one, or a batch of them, as it is; one observation of the environment's own as one.
@@ -174,10 +175,15 @@ def needs_flattening(space: gym.Space[Any]) -> bool:
 
 
 def flattened(env: gym.Env[Any, Any]) -> Any:
-    """Return an environment that observes vectors or images: itself if it does, or if none can be made."""
+    """Return an environment that observes vectors or images: itself if it does, or if none can be made.
+
+    Images of bytes are of bytes then, whatever type of numbers the environment gives.
+    """
     space = env.observation_space
-    if not isinstance(space, gym.Space) or not needs_flattening(space):
+    if not isinstance(space, gym.Space):
         return env
+    if not needs_flattening(space):
+        return ByteImages(env) if space.dtype == np.uint8 else env
     try:
         return FlatObservations(env, FlatBox(space))
     except ValueError:
@@ -243,18 +249,18 @@ def _member(observation: Any, keys: tuple[Any, ...]) -> Any:
     return value
 
 
-def _write(numbers: NDArray[np.float32], part: _Part, value: Any) -> None:
+def _write(numbers: NDArray[Any], part: _Part, value: Any) -> None:
     """Write the numbers of one member, all zero so far.
 
     Raises:
-        ValueError: The value is not of its space.
+        ValueError: The value is not of its space, or of bytes and one of its numbers is none.
     """
     if problem := _written(numbers, part, value):
         raise ValueError(f"{shortened(value)} as {named(part.keys)}, {problem}")
 
 
-def _written(numbers: NDArray[np.float32], part: _Part, value: Any) -> str:
-    """Write them; return what is wrong with the value, as words behind it, or nothing."""
+def _written(numbers: NDArray[Any], part: _Part, value: Any) -> str:
+    """Write them; return what is wrong with the value, as words behind it, or nothing; of bytes see `as_bytes`."""
     try:
         array = np.asarray(value)
     except Exception:  # noqa: BLE001 (ragged lists, say)
@@ -265,7 +271,7 @@ def _written(numbers: NDArray[np.float32], part: _Part, value: Any) -> str:
         return f"not numbers of shape {shape}" if shape else "not a number"
     if isinstance(part.space, gym.spaces.Box):
         with np.errstate(over="ignore"):
-            numbers[:] = array.ravel()
+            numbers[:] = (as_bytes(array) if numbers.dtype == np.uint8 else array).ravel()
         return ""
     if array.dtype.kind not in "biu":
         return "not whole numbers"

@@ -11,7 +11,6 @@ observes what it did in training.
 from __future__ import annotations
 
 import copy
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -36,6 +35,7 @@ from policies.envs.own_actions import Choices, TakesActions, UnsupportedActionsE
 from policies.envs.own_process import InOwnProcess
 from policies.envs.own_vectors import own_vector_env, takes_vector_entry_point
 from policies.envs.rendering import choose_before_import, draw_without_display, without_window
+from policies.envs.signatures import named_parameters, takes_any_name
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
 from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
@@ -65,8 +65,8 @@ _RESERVED_ARGS = frozenset({
     FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES,
 })  # fmt: skip
 _RGB_ARRAY = "rgb_array"
-# The one argument of gym.make, not of the constructor, that a sweep file may set.
-_MAKE_ARGS = frozenset({"max_episode_steps"})
+_LIMIT = "max_episode_steps"
+"""The one argument of gym.make that a sweep file may set; it is the constructor's, too, if that has one of the name."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,12 @@ def _made(
     creator = _creator(env_id, spec)
     if wrappers.atari is not None:
         kwargs = wrappers.atari.game_args(env_id, creator, kwargs)
-    entry = partial(InOwnProcess, env_id) if wrappers.own_process else creator
+    entry: Any = partial(InOwnProcess, env_id) if wrappers.own_process else creator
+    if _LIMIT in kwargs and _LIMIT in named_parameters(creator):
+        # Gymnasium's functions take it for themselves, also from what the env is registered with where they make many.
+        limit = {_LIMIT: kwargs[_LIMIT]}
+        spec = replace(spec, kwargs={**spec.kwargs, **limit})
+        entry = partial(entry, **limit)
     made = replace(spec, entry_point=entry) if isinstance(entry, partial) else spec
     return without_window(partial(make, made), kwargs, creator, spec.kwargs)
 
@@ -300,13 +305,7 @@ def _creator(env_id: str, spec: EnvSpec) -> Callable[..., Any] | None:
 def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
     """Refuse arguments that the constructor does not take, and suggest the nearest one that it takes."""
     creator = _creator(env_id, spec)
-    takes_any = creator is None
-    known = set(_MAKE_ARGS)
-    if creator is not None:
-        parameters = inspect.signature(creator).parameters.values()
-        takes_any = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters)
-        known |= {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-    known -= _RESERVED_ARGS
+    takes_any, known = takes_any_name(creator), {_LIMIT, *named_parameters(creator)} - _RESERVED_ARGS
     for name, value in env_args.items():
         if name in _RESERVED_ARGS:
             raise EnvError(
@@ -318,8 +317,8 @@ def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
                 f"{env_id} takes no argument {name!r} (value {value!r}).{did_you_mean(name, sorted(known))}",
                 f"It takes: {', '.join(sorted(known))}.",
             )
-    if "max_episode_steps" in env_args:
-        _check_limit(env_id, env_args["max_episode_steps"])
+    if _LIMIT in env_args:
+        _check_limit(env_id, env_args[_LIMIT])
 
 
 def _check_limit(env_id: str, limit: Any) -> None:

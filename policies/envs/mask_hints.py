@@ -12,8 +12,9 @@ import numpy as np
 
 from policies.envs.mask_settings import ACTION_MASK, ACTIONS, Setting, names_in
 from policies.envs.mask_values import checked_mask, listed_mask
-from policies.envs.masks import MaskedBox, member_problem, needs_nothing
+from policies.envs.masks import MaskedBox, member_problem
 from policies.envs.own_actions import sizes_of
+from policies.envs.signatures import needs_nothing
 
 _LIKE_MASKS = re.compile("mask|legal|valid|allowed")
 _IS_CALLED_MASK = re.compile("(?=.*mask)(?=.*(?:action|move|legal|valid|allowed))")

@@ -11,7 +11,6 @@ an info may also list the actions that are allowed, of which a mask is made.
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -21,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from policies.envs.byte_images import as_bytes
 from policies.envs.flat import FlatBox, needs_flattening
 from policies.envs.mask_settings import ACTION_MASK, METHOD, Setting, lists_actions, names_in
 from policies.envs.mask_values import MaskProblemError, checked_mask, is_one_mask, listed_mask
 from policies.envs.own_actions import sizes_of
+from policies.envs.signatures import needs_nothing
 from policies.errors import EnvError, shortened
 
 FORBIDDEN = float(np.finfo(np.float32).min)
@@ -89,7 +90,11 @@ class MaskedBox(gym.spaces.Box):
             ValueError: The observation is not of the space.
         """
         seen = self.seen
-        numbers = seen.flat(observation) if isinstance(seen, FlatBox) else np.asarray(observation, np.float32)
+        if isinstance(seen, FlatBox):
+            numbers = seen.flat(observation)
+        else:
+            is_bytes = seen.dtype == np.uint8
+            numbers = as_bytes(np.asarray(observation)) if is_bytes else np.asarray(observation, np.float32)
         if numbers.shape != seen.shape:
             raise ValueError(f"an observation of shape {numbers.shape}, not {seen.shape}")
         return np.concatenate([mask, numbers.ravel()])
@@ -234,7 +239,13 @@ class MasksActions(gym.Wrapper[Any, Any, Any, Any]):
         )
         value: Any = None
         if self.source == "method":
-            value = self.env.get_wrapper_attr(self.name)()
+            try:
+                value = self.env.get_wrapper_attr(self.name)()
+            except Exception:
+                # A game that is over may have no actions to ask for.
+                if is_over:
+                    return self._everything
+                raise
         else:
             holder = observation if self.source == "observation" else info
             try:
@@ -366,15 +377,6 @@ def _find(env: gym.Env[Any, Any], setting: Setting) -> tuple[Source, str] | None
     if env.has_wrapper_attr(method) and needs_nothing(env.get_wrapper_attr(method)):
         return "method", method
     return None if setting is None else ("info", name)
-
-
-def needs_nothing(method: Any) -> bool:
-    """Whether something is a method that needs no arguments; Taxi's `action_mask(state)` does."""
-    try:
-        inspect.signature(method).bind()
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def member_problem(observed: gym.spaces.Dict, name: str, sizes: tuple[int, ...]) -> str:

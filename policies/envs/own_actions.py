@@ -97,8 +97,8 @@ class Numbers(gym.spaces.Box):
         dtype = np.result_type(np.float32, *floats)
         with np.errstate(over="ignore"):
             low, high = (
-                np.concatenate([getattr(space, side).ravel().astype(dtype) for space in self._boxes])
-                for side in ("low", "high")
+                np.concatenate([bound.ravel().astype(dtype) for bound in sides])
+                for sides in zip(*map(_bounds, self._boxes), strict=True)
             )
         super().__init__(low, high, dtype=dtype.type)
 
@@ -225,6 +225,24 @@ def own_actions(space: gym.Space[Any], actions: NDArray[Any]) -> Any:
     if isinstance(space.original, gym.spaces.Dict | gym.spaces.Tuple):
         return each
     return np.array(each).reshape(len(each), *(space.original.shape or ()))
+
+
+def is_bounded(space: gym.spaces.Box) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return where a Box has lower bounds, and where upper ones, by their values, which are all that files have.
+
+    Gymnasium writes infinite bounds of whole numbers as the least and the largest that their type holds. Of few bits
+    those are taken for bounds, as of bytes, and so are those of numbers without a sign, which it lets nobody leave out.
+    """
+    if space.dtype in (np.int32, np.int64):
+        most = np.iinfo(space.dtype)
+        return space.low > most.min, space.high < most.max
+    return space.low > -np.inf, space.high < np.inf
+
+
+def _bounds(space: gym.spaces.Box) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the bounds of a Box, infinite where it has none."""
+    below, above = is_bounded(space)
+    return np.where(below, space.low, -np.inf), np.where(above, space.high, np.inf)
 
 
 def _check_total(total: int, original: gym.Space[Any]) -> None:

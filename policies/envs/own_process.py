@@ -16,6 +16,7 @@ import sys
 import threading
 import weakref
 from functools import partial
+from inspect import Parameter, Signature
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -27,6 +28,7 @@ from policies.child_processes import BEGINNING, how_it_ended
 from policies.envs.faults import Frame, note_signals, place_in_env, set_place
 from policies.envs.modules import allow_modules, allowed_modules
 from policies.envs.rendering import choose_before_import, draw_without_display
+from policies.envs.signatures import needs_nothing
 from policies.errors import said_by
 from policies.parents import end_with_parent
 
@@ -61,6 +63,13 @@ class _About(NamedTuple):
 
 class _Method(NamedTuple):
     """An attribute that can be called."""
+
+    needs_nothing: bool
+    """Whether it needs no arguments."""
+
+
+_NEEDS_SOMETHING = Signature([Parameter("argument", Parameter.POSITIONAL_ONLY)])
+"""What methods of the environment that need arguments look like from here; the others take anything."""
 
 
 class InOwnProcess(gym.Env[Any, Any]):
@@ -99,7 +108,7 @@ class InOwnProcess(gym.Env[Any, Any]):
             raise
         self.observation_space, self.action_space = about.observation_space, about.action_space
         self.metadata, self.render_mode = about.metadata, env_args.get("render_mode")
-        self._methods: set[str] = set()
+        self._methods: dict[str, _Method] = {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment."""
@@ -125,8 +134,11 @@ class InOwnProcess(gym.Env[Any, Any]):
             found = self._ask(name, None, None)
             if not isinstance(found, _Method):
                 return found
-            self._methods.add(name)
-        return partial(self._call, name)
+            self._methods[name] = found
+        method: Any = partial(self._call, name)
+        if not self._methods[name].needs_nothing:
+            method.__signature__ = _NEEDS_SOMETHING
+        return method
 
     def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
         return self._ask(method, args, kwargs)
@@ -233,7 +245,7 @@ def _about(env: Any) -> _About:
 def _answer(env: Any, name: str, args: tuple[Any, ...] | None, kwargs: dict[str, Any] | None) -> Any:
     found = env.get_wrapper_attr(name) if isinstance(env, gym.Wrapper) else getattr(env, name)
     if args is None:
-        return _Method() if callable(found) else found
+        return _Method(needs_nothing(found)) if callable(found) else found
     return found(*args, **(kwargs or {}))
 
 

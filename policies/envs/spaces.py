@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from policies.envs.flat import MAX_SIZE, FlatBox, leaves
 from policies.envs.masks import MaskedBox
-from policies.envs.own_actions import Choices, is_made, made_of
+from policies.envs.own_actions import Choices, is_bounded, is_made, made_of
 from policies.envs.stacked import StackedBox
 from policies.errors import MALFORMED, CheckpointError, shortened
 
@@ -200,7 +200,10 @@ def _any_from_description(description: Mapping[str, Any]) -> gym.Space[Any]:
     if kind == "box":
         dtype, shape = np.dtype(description["dtype"]), _checked_shape(description)
         low, high = (_bounds_from_json(description[key], shape, dtype) for key in ("low", "high"))
-        return gym.spaces.Box(low, high, shape, dtype.type)
+        box = gym.spaces.Box(low, high, shape, dtype.type)
+        # What is drawn from it depends on these.
+        box.bounded_below, box.bounded_above = is_bounded(box)
+        return box
     raise ValueError(f"no space is of type {str(kind)[:80]!r}")
 
 

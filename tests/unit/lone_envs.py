@@ -62,6 +62,20 @@ class Lone(gym.Env[Any, Any]):
         raise ZeroDivisionError("it is broken")
 
 
+class AsksForState(Lone):
+    """Its mask is an info; a method of the same name needs the state, as Taxi's does."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return super().reset(seed=seed)[0], {"mask": self.mask(self.steps)}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return *super().step(action)[:4], {"mask": self.mask(self.steps)}
+
+    def mask(self, state: int, *, sure: bool = True) -> NDArray[np.bool_]:
+        """What is allowed in a state."""
+        return np.array([state > 0, state > 0, sure])
+
+
 class Behind(gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper around the walk, which is an environment class, too."""
 

@@ -228,3 +228,10 @@ def test_an_episode_that_nobody_watches_leaves_no_env_open() -> None:
     assert Grows.num_open == 0
     assert len(list(watch_episode(policy(), ENV, {}, 0)[1])) == 5
     assert Grows.num_open == 0
+
+
+def test_render_modes_that_are_no_names_are_told_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(Grows, "metadata", {"render_modes": [None, "human"]})
+    policy = ConstantPolicy(Grows.observation_space, Grows.action_space, 0, env_id=ENV)
+    with pytest.raises(EnvError, match=r"cannot be filmed: .*\(it has: None, human\)"):
+        record_video(policy, env_id=ENV, seeds=1, mp4=tmp_path / "a.mp4")

@@ -107,6 +107,49 @@ def test_whole_numbers_are_rounded_to_the_nearest() -> None:
     assert made.own(np.array([0.4, -2.6, 3.51], np.float32)).tolist() == [0, -3, 4]
 
 
+ENDLESS: dict[str, tuple[gym.Space[Any], list[int]]] = {
+    "one bound": (spaces.Box(0, np.inf, (2,), np.int64), [3, 0]),
+    "the other": (spaces.Box(-np.inf, 1, (2,), np.int64), [1, -7]),
+    "none": (spaces.Box(-np.inf, np.inf, (2,), np.int32), [3, -7]),
+    "written out": (spaces.Box(np.array([0, -99]), np.full(2, np.iinfo(np.int64).max), dtype=np.int64), [3, -7]),
+}
+
+
+@pytest.mark.parametrize("is_read", [False, True])
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_whole_numbers_with_one_bound_or_none_are_not_stretched(kind: str, is_read: bool) -> None:
+    def made(space: gym.Space[Any]) -> Any:
+        found = made_of(space)
+        return space_from_description(json.loads(json.dumps(describe_space(found)))) if is_read else found
+
+    space, wanted = ENDLESS[kind]
+    alone = made(space)
+    assert not ToBounds(alone).stretches_all
+    assert alone.own(ToBounds(alone)(np.array([3.2, -7.0], np.float32))).tolist() == wanted
+    beside = made(spaces.Dict({"a": space, "b": spaces.Box(-2, 6, (1,), np.int16)}))
+    own = beside.own(ToBounds(beside)(np.array([3.2, -7.0, 0.5], np.float32)))
+    assert (own["a"].tolist(), own["b"].tolist()) == (wanted, [4])
+
+
+@pytest.mark.parametrize("kind", ["one bound", "the other", "none"])
+def test_a_space_that_was_read_draws_what_the_envs_own_does(kind: str) -> None:
+    space = copy.deepcopy(ENDLESS[kind][0])
+    read = space_from_description(json.loads(json.dumps(describe_space(made_of(space)))))
+    for seed in range(5):
+        space.seed(seed)
+        read.seed(seed)
+        assert read.sample().tolist() == space.sample().tolist()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint32, np.uint64])
+def test_whole_numbers_of_few_bits_and_without_a_sign_are_stretched_over_all_of_them(dtype: Any) -> None:
+    least, most = np.iinfo(dtype).min, np.iinfo(dtype).max
+    made = made_of(spaces.Box(least, most, (3,), dtype))
+    found = made.own(ToBounds(cast("Any", made))(np.array([-1, 0, 1], np.float32)))
+    assert (found[0], found[2]) == (least, most)
+    assert found[1] == pytest.approx((float(least) + float(most)) / 2, rel=1e-6, abs=1)
+
+
 @pytest.mark.parametrize("kind", ALL)
 def test_the_space_is_described_copied_and_read_again(kind: str) -> None:
     made = made_of(ALL[kind])

@@ -93,6 +93,19 @@ def test_a_method_of_what_is_behind_a_wrapper_is_found() -> None:
     assert check_env("lone_envs:Behind", ALONE).mask == "action_masks()"
 
 
+@pytest.mark.parametrize("alone", [{}, ALONE], ids=str)
+def test_a_method_that_needs_arguments_is_no_mask(alone: dict[str, Any]) -> None:
+    assert check_env("lone_envs:AsksForState", {**alone, "action_mask": "mask"}).mask == "info['mask']"
+    assert check_env("lone_envs:AsksForState", {**alone, "action_mask": None}).mask == "action_masks()"
+    env = make_env("lone_envs:AsksForState", {**alone, "action_mask": "mask"})
+    env.reset(seed=0)
+    inner: Any = env.unwrapped
+    # It can be called as it is there.
+    assert inner.mask(0, sure=False).tolist() == [False, False, False]
+    assert inner.mask(state=1).tolist() == [True, True, True]
+    close_env(env)
+
+
 @pytest.mark.parametrize("threads", [None, "3"])
 def test_it_multiplies_with_one_thread_unless_more_are_asked_for(
     monkeypatch: pytest.MonkeyPatch, threads: str | None
