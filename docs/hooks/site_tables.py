@@ -28,9 +28,7 @@ def sweep_fields() -> str:
     """The fields of a sweep file, and under a heading each those of its sections."""
     schema = json_schema()
     definitions = schema["$defs"]
-    # Empty counts as left out, whatever the field is: the page says so once.
-    fields = {name: field if field.get("default", "") is None else _without_null(field)
-              for name, field in schema["properties"].items()}  # fmt: skip
+    fields = _without_empty(schema)["properties"]
     sections = {name: section for name, field in fields.items() if (section := _section(field)) is not None}
     # A section may have one itself, whose heading is its path.
     for name, section in list(sections.items()):
@@ -39,7 +37,7 @@ def sweep_fields() -> str:
     links = {section: f"mapping, [below](#{name.replace('.', '')})" for name, section in sections.items()}
     parts = [_fields({**schema, "properties": fields}, links)]
     for name, section in sections.items():
-        inner = definitions[section]
+        inner = _without_empty(definitions[section])
         parts.append(f"## {name}\n\n{inner['description']}\n\n{_fields(inner, links)}")
     return "\n\n".join(parts)
 
@@ -158,6 +156,13 @@ def _section(field: Schema) -> str | None:
         if kind is not field and (inner := _section(kind)) is not None:
             return inner
     return None
+
+
+def _without_empty(section: Schema) -> Schema:
+    """A mapping without the null of its fields that is the same as leaving them out: the page says so once."""
+    fields = {name: field if field.get("default", "") is None else _without_null(field)
+              for name, field in section["properties"].items()}  # fmt: skip
+    return {**section, "properties": fields}
 
 
 def _without_null(field: Schema) -> Schema:

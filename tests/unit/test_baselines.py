@@ -309,6 +309,17 @@ def test_a_plan_refuses_a_constant_action_that_the_env_does_not_have(
         assert "--set hyperparams.action=[0.0]" in caught.value.hint
 
 
+def test_of_searched_actions_no_fixed_one_is_proposed() -> None:
+    given = {"env": "Pendulum-v1", "algorithm": "constant", "space": {"action": {"grid": [[0.5], [9.0]]}}}
+    with pytest.raises(SpecError) as caught:
+        make_plan(load_spec(given), Machine(4))
+    assert caught.value.hint == "Let space.action give only actions that there are, such as [0.0]."
+    with pytest.raises(SpecError, match="but also searched"):
+        load_spec(given, ["hyperparams.action=[0.0]"])
+    followed = load_spec(given, ["space.action={grid: [[0.5], [0.0]]}"])
+    assert [trial.point["action"] for trial in make_plan(followed, Machine(4)).trials] == [[0.5], [0.0]]
+
+
 def test_the_action_can_be_set_and_searched() -> None:
     spec = load_spec({"env": "CartPole-v1", "algorithm": "constant"}, ["hyperparams.action=1"])
     assert [trial.hyperparams["action"] for trial in make_plan(spec, Machine(1)).trials] == [1]

@@ -78,6 +78,35 @@ def test_a_cost_in_which_trainings_can_not_differ_is_noted() -> None:
     assert notes(objective=pair, space={"stop.num_env_steps": {"choice": [5_000, 9_000]}}) == []
 
 
+def test_no_cost_is_noted_in_which_trainings_differ_by_another_end_than_a_goal() -> None:
+    def notes(algorithm: str = "ppo", **fields: Any) -> list[str]:
+        return idle_settings(
+            load_spec({**SWEEP, "algorithm": algorithm, "objective": ["return", "env_steps"], **fields})
+        )
+
+    assert notes(stop={"num_episodes": 100}) == []
+    sizes, steps = {"train_batch_size": {"choice": [512, 1024]}}, {"env_steps_per_iteration": {"choice": [500, 1000]}}
+    assert (
+        notes(space=sizes, stop={"num_iterations": 20}) == notes("dqn", space=steps, stop={"num_iterations": 20}) == []
+    )
+    # Iterations of one length, as many for all, are as long; and an iteration of DQN is no longer with larger batches.
+    assert notes(stop={"num_iterations": 20})
+    assert notes("dqn", space={"train_batch_size": {"choice": [32, 64]}}, stop={"num_iterations": 20})
+    assert notes(space=sizes)
+
+
+def test_with_hyperband_no_length_is_proposed_that_it_refuses() -> None:
+    length: dict[str, Any] = {"stop.num_env_steps": {"choice": [20_000, 50_000]}}
+    given = {**SWEEP, "objective": ["return", "env_steps"]}
+    assert "search their length" in idle_settings(load_spec({**given, "scheduler": "asha"}))[0]
+    assert idle_settings(load_spec({**given, "scheduler": "asha", "space": length})) == []
+    (told,) = idle_settings(load_spec({**given, "scheduler": "hyperband"}))
+    assert told.endswith("as long: end them at a goal (stop.training_return, stop.evaluation_return).")
+    assert idle_settings(load_spec({**given, "scheduler": "hyperband", "stop": {"training_return": 5}})) == []
+    with pytest.raises(SpecError, match=r"cannot be used with scheduler\.type hyperband"):
+        load_spec({**given, "scheduler": "hyperband", "space": length})
+
+
 def with_cost(made: Synthetic, cost: str | None = "env_steps") -> Synthetic:
     spec = {**made.sweep.spec, "objective": {"type": "final", "cost": cost}}
     return dataclasses.replace(made, sweep=made.sweep.model_copy(update={"spec": spec}))

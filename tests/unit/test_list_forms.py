@@ -10,6 +10,7 @@ from tests.narrowing import present
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.transitions import pending_record
 
 
@@ -75,6 +76,30 @@ def test_fixed_sizes_that_are_no_list_of_numbers(fixed: Any, told: str) -> None:
 )
 def test_searched_sizes_that_are_no_list_of_networks(domain: Any, told: str) -> None:
     assert errors(space={"hidden_sizes": domain}).endswith(f"space.hidden_sizes{told}")
+
+
+@pytest.mark.parametrize(
+    ("domain", "told", "followed"),
+    [
+        ([64, 64], "bare list: write {grid: [[64, 64]]} for one network of 2 layers", {"grid": [[64, 64]]}),
+        ({"grid": "64x64"}, "a list: write [[64, 64]] for one network of 2 layers", {"grid": [[64, 64]]}),
+        ({"choice": "8, 16, 8"}, "a list: write [[8, 16, 8]] for one network of 3 layers", {"choice": [[8, 16, 8]]}),
+        ([64, [64], [8, 8]], "write {grid: [64, [8, 8]]} to try each of its values", {"grid": [64, [8, 8]]}),
+    ],
+)
+def test_no_value_is_proposed_twice_which_would_be_refused(domain: Any, told: str, followed: Any) -> None:
+    assert errors(space={"hidden_sizes": domain}).endswith(told)
+    assert sizes_of(space={"hidden_sizes": followed})
+
+
+def test_nor_is_it_for_other_hyperparameters() -> None:
+    told = "write {grid: [0.1, 0.01]} "
+    assert told in errors(space={"lr": [0.1, 0.01, 0.1]})
+    assert told in errors(hyperparams={"lr": [0.1, 0.01, 0.1]})
+    assert load_spec({**MINIMAL, "space": {"lr": {"grid": [0.1, 0.01]}}})
+    with pytest.raises(SpecError, match="is a bare list"):  # of what no file could hold
+        SweepSpec.model_validate({**MINIMAL, "space": {"lr": [{1, 2}]}})
+    assert errors(space={"lr": []}).endswith("[] is a bare list: write {grid: [...]} to try each of its values")
 
 
 def test_the_same_from_set() -> None:

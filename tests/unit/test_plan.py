@@ -150,6 +150,33 @@ def test_what_would_wait_for_ever_is_refused_with_the_numbers(
         assert part in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("given", "told", "followed"),
+    [
+        ({"num_env_runners": 4}, "resources.num_env_runners to at most 3", {"num_env_runners": 3}),
+        ({"num_cpus": 8}, "resources.num_cpus to at most 4", {"num_cpus": 4}),
+        (
+            {"num_cpus": 8, "num_env_runners": 2},
+            "resources.num_cpus to at most 4",
+            {"num_cpus": 4, "num_env_runners": 2},
+        ),
+        (
+            {"num_cpus": 8, "num_env_runners": 4},
+            "resources.num_cpus to at most 4 and resources.num_env_runners to at most 3",
+            {"num_cpus": 4, "num_env_runners": 3},
+        ),
+    ],
+)
+def test_a_trial_fits_with_the_settings_that_are_told(
+    given: dict[str, int], told: str, followed: dict[str, int]
+) -> None:
+    source = {"env": "CartPole-v1", "algorithm": "ppo"}
+    with pytest.raises(CannotRunError) as caught:
+        plan(source={**source, "resources": given}, machine=Machine(4))
+    assert caught.value.hint.startswith(f"Set {told}, or launch on")
+    assert plan(source={**source, "resources": followed}, machine=Machine(4)).cpus_per_trial == 4
+
+
 def test_values_that_contradict_each_other_are_told_with_their_point() -> None:
     with pytest.raises(SpecError) as caught:
         plan("hyperparams.minibatch_size=", "space.minibatch_size={grid: [256, 2048]}")

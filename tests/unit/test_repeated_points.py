@@ -32,6 +32,14 @@ def test_the_different_points_of_a_listed_space_are_those_that_conditions_leave(
         assert note.startswith("The space has 7 different points, so some of the 9 that num_samples gives are the same")
 
 
+def test_a_population_may_begin_with_the_same_points_which_it_changes() -> None:
+    grid: dict[str, Any] = {"lr": {"grid": [1e-4, 1e-3]}}
+    (note,) = notes(grid, 4)
+    assert "seeds_per_point does that" in note
+    # With a population it doesn't: there each trial has values of its own.
+    assert notes(grid, 4, scheduler="pbt") == []
+
+
 def test_combinations_of_grids_in_which_nothing_random_acts_are_told_to_be_repeated() -> None:
     alpha = {"uniform": [0.1, 0.9], **WHEN}
     space: dict[str, Any] = {"replay": {"grid": REPLAY}, "prioritized_alpha": alpha, "lr": {"grid": [1e-4, 1e-3]}}

@@ -357,3 +357,14 @@ def test_bad_sweep_names(name: str) -> None:
 def test_good_sweep_names(name: str) -> None:
     assert check_sweep_name(name) == name
     assert load_spec({**MINIMAL, "name": name}).name == name
+
+
+@pytest.mark.parametrize("name", ["random", "constant"])
+def test_a_new_sweep_is_not_called_as_a_baseline_is(name: str) -> None:
+    with pytest.raises(
+        SpecError, match=f"The sweep name '{name}' is not allowed: .* it is the {name} policy"
+    ) as caught:
+        check_sweep_name(name)
+    assert f"'{name}-sweep'" in caught.value.hint
+    # Sweeps of former versions may be, and their files are still read.
+    assert load_spec({**MINIMAL, "name": name}).name == name

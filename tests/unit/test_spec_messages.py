@@ -194,6 +194,53 @@ def test_a_dotted_key_is_written_in_braces_and_nothing_is_guessed_across_the_dot
 
 
 @pytest.mark.parametrize(
+    ("fields", "told", "followed"),
+    [
+        (
+            {"space.lr.loguniform": [1e-4, 1e-2]},
+            "write space: {lr: {loguniform: ...}}",
+            {"space": {"lr": {"loguniform": [1e-4, 1e-2]}}},
+        ),
+        (
+            {"space.stop.num_env_steps.choice": [3000, 4000]},
+            "write space: {stop.num_env_steps: {choice: ...}}",
+            {"space": {"stop.num_env_steps": {"choice": [3000, 4000]}}},
+        ),
+        (
+            {"space": {"num_epochs": {"grid": [2, 3]}}, "space.lr.when": {"num_epochs": 2}},
+            "write space: {lr: {when: ...}}",
+            {"space": {"num_epochs": {"grid": [2, 3]}, "lr": {"uniform": [0.1, 1], "when": {"num_epochs": 2}}}},
+        ),
+        ({"space.lr": {"grid": [0.1]}}, "write space: {lr: ...}", {"space": {"lr": {"grid": [0.1]}}}),
+    ],
+)
+def test_a_dotted_key_of_the_space_is_written_with_its_domain_in_braces(
+    fields: dict[str, Any], told: str, followed: dict[str, Any]
+) -> None:
+    assert present(problem_with({**MINIMAL, **fields})).endswith(told)
+    assert problem_with({**MINIMAL, **followed}) is None
+
+
+@pytest.mark.parametrize("prior", [2024, [2024]])
+def test_the_name_of_a_sweep_that_is_a_number_is_put_in_quotes(tmp_path: Path, prior: Any) -> None:
+    told = "2024 is a number: put it in quotes, '2024', and on a command line in two pairs, \"'2024'\""
+    assert problem_with({**MINIMAL, "name": 2024}) == f"sweep: name: {told}"
+    assert load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nname: '2024'\n")).name == "2024"
+    # The shell has taken a pair of them.
+    with pytest.raises(SpecError, match=re.escape(f"name: {told} (from --set)")):
+        load_spec(MINIMAL, ["name=2024"])
+    assert load_spec(MINIMAL, ["name='2024'"]).name == "2024"
+    searched = {**MINIMAL, "search": "gp", "num_samples": 12, "space": {"lr": {"uniform": [0.1, 0.2]}}}
+    assert told in present(problem_with({**searched, "prior": prior}))
+    assert load_spec({**searched, "prior": "2024"}).prior == ("2024",)
+
+
+@pytest.mark.parametrize("name", [-1, True])
+def test_what_no_quotes_make_a_name_is_told_how_a_name_is(name: Any) -> None:
+    assert "is not allowed: use up to 100 letters, digits" in present(problem_with({**MINIMAL, "name": name}))
+
+
+@pytest.mark.parametrize(
     ("name", "suggestion"),
     [
         ("stop.num_env_step", " Did you mean 'stop.num_env_steps'?"),

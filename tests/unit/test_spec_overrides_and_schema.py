@@ -1,7 +1,7 @@
 """Sweep files: `--set`, and their JSON Schema."""
 
 from collections.abc import Iterator
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import pytest
 from pydantic import BaseModel
@@ -10,8 +10,10 @@ from spec_errors import MINIMAL, errors
 from policies.errors import SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Algorithm
 from tune_jobs.spec.domains import DOMAIN_KINDS
+from tune_jobs.spec.fields import Section
 from tune_jobs.spec.file import json_schema, list_presets, load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.yaml import parse_yaml
 
 # -- --set
 
@@ -51,6 +53,72 @@ def test_set_to_nothing_of_what_is_not_there_changes_nothing(path: str) -> None:
 def test_an_empty_field_is_only_a_default_if_there_is_one() -> None:
     assert load_spec({**MINIMAL, "stop": None}) == load_spec(MINIMAL)
     assert "num_sample: there is no field 'num_sample' here." in errors(num_sample=None)
+
+
+EMPTY = [
+    "stop: {num_episodes: }",
+    "stop:\n  training_return:\n  num_env_steps: 1000",
+    "evaluation:\n  num_episodes:",
+    "scheduler:\n  type:",
+    "scheduler: {type: asha, reduction_factor: }",
+    "search:\n  type:",
+    "objective: {type: , cost: env_steps}",
+    "resources: {num_gpus: }",
+    "checkpoints: {every_iterations: null}",
+    "confirm: {top: , seeds: 3}",
+    "about: {title: , source: a book}",
+    "env:\n  id: CartPole-v1\n  args:\n    # size: 3",
+    "env: {id: CartPole-v1, frame_stack: , atari: {frame_skip: }}",
+]
+
+
+def without_null(data: Any) -> Any:
+    if not isinstance(data, dict):
+        return data
+    return {key: without_null(value) for key, value in data.items() if value is not None}
+
+
+@pytest.mark.parametrize("lines", EMPTY)
+def test_an_empty_field_of_a_section_is_as_if_it_was_not_there(lines: str) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    data = {**MINIMAL, **parse_yaml(lines, "lines")}
+    assert data != without_null(data)
+    assert load_spec(data) == load_spec(without_null(data))
+    assert list(jsonschema.Draft202012Validator(json_schema()).iter_errors(data)) == []
+
+
+@pytest.mark.parametrize("path", ["stop.num_env_steps", "stop.num_iterations", "stop.time_s", "checkpoints.keep"])
+def test_a_limit_that_is_null_is_refused_as_it_may_be_meant_as_none(path: str) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    section, _, name = path.partition(".")
+    told = {section: {name: None}}
+    with pytest.raises(SpecError, match=f"{path}: None is not allowed: it should be a "):
+        load_spec({**MINIMAL, **told})
+    assert list(jsonschema.Draft202012Validator(json_schema()).iter_errors({**MINIMAL, **told}))
+
+
+def test_a_field_that_must_be_given_is_missing_if_it_is_empty() -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    assert "env.id: is missing: give a Gymnasium id such as CartPole-v1" in errors(env={"id": None, "frame_stack": 2})
+    assert list(jsonschema.Draft202012Validator(json_schema()).iter_errors({**MINIMAL, "env": {"id": None}}))
+    assert "stop.time: there is no field 'time' here" in errors(stop={"time": None})
+
+
+def test_null_is_a_value_where_names_are_not_those_of_fields() -> None:
+    given = {"env": {"id": "CartPole-v1", "args": {"size": None}}, "hyperparams": {"grad_clip": None}}
+    spec = load_spec({**MINIMAL, **given, "space": {"lr": {"uniform": [0.1, 1]}}, "points": [{"lr": None}]})
+    assert (spec.env.args, spec.hyperparams, spec.points) == ({"size": None}, {"grad_clip": None}, ({"lr": None},))
+    assert "space.lr: null is one value" in errors(space={"lr": None})
+    assert "hyperparams.lr: None is not allowed" in errors(hyperparams={"lr": None})
+
+
+@pytest.mark.parametrize("section", Section.__subclasses__())
+def test_a_field_that_may_be_null_is_null_if_it_is_left_out(section: type[Section]) -> None:
+    """Else null, which is as if left out, would no longer be what it says."""
+    for name, field in section.model_fields.items():
+        if type(None) in get_args(field.annotation):
+            assert not field.is_required(), name
+            assert field.default is None, name
 
 
 def test_set_to_nothing_takes_a_field_out_so_that_a_searched_one_can_be_fixed() -> None:

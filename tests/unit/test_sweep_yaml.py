@@ -131,6 +131,39 @@ def test_a_comma_in_a_number_is_told_with_the_number(text: str, message: str, hi
     assert hint in caught.value.hint
 
 
+@pytest.mark.parametrize(
+    ("text", "message", "hint", "followed"),
+    [
+        (
+            "{choice: [20,000, 50,000]}",
+            "line 1, column 11: 20,000 is 20 and 000 here, as commas separate what is in brackets",
+            "Write 20000 or 20_000.",
+            "{choice: [20_000, 50_000]}",
+        ),
+        ("[-1,500,000]", "-1,500,000 is -1 and 500 and 000 here", "Write -1500000 or -1_500_000.", "[-1_500_000]"),
+        ("[5, 1,050]", "column 5: 1,050 is 1 and 050 here", "Write 1050 or 1_050.", "[5, 1_050]"),
+    ],
+)
+def test_a_comma_in_a_number_of_a_list_is_told_with_the_number(
+    text: str, message: str, hint: str, followed: str
+) -> None:
+    with pytest.raises(SpecError) as caught:
+        parse_yaml(text, "x.yaml")
+    assert message in caught.value.message
+    assert caught.value.hint == hint
+    assert parse_yaml(followed, "x.yaml")
+
+
+def test_several_numbers_in_a_list_need_no_space_between_them() -> None:
+    assert parse_yaml("[1,200, 64,128,0]", "x") == [1, 200, 64, 128, 0]
+    assert parse_yaml("[20,'000', 20,!!str 000]", "x") == [20, "000", 20, "000"]
+    assert "010 begins with 0" in refused("[1, 010]")
+    assert "000 begins with 0" in refused("[1500,000]")
+    # Each is looked at once, which is soon done.
+    many = [100] * 10_000
+    assert parse_yaml(f"[{','.join(map(str, many))}]", "x") == many
+
+
 def test_keys_of_digits_may_stay_empty_where_no_number_is_before_them() -> None:
     assert parse_yaml("{a: x, 000}", "x") == {"a": "x", "000": None}
     assert parse_yaml("{000, 1: 3, 5: 2}", "x") == {"000": None, "1": 3, "5": 2}

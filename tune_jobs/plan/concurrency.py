@@ -40,9 +40,7 @@ def refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
     if cpus > machine.num_cpus:
         hint = machine.more
         if machine.num_cpus >= 1:
-            most = int(machine.num_cpus)
-            setting = f"num_env_runners to at most {most - 1}" if runners else f"num_cpus to at most {most}"
-            hint = f"set resources.{setting}, or {hint}"
+            hint = f"set {_settings_that_fit(spec, int(machine.num_cpus))}, or {hint}"
         raise CannotRunError(
             f"One trial needs {counted(cpus, 'CPU')}{made_of}; {machine.source} has {machine.num_cpus:g}. {FOR_EVER}",
             f"{hint[0].upper()}{hint[1:]}.",
@@ -67,3 +65,14 @@ def refuse_too_large(spec: SweepSpec, machine: Machine) -> None:
             f"node of {machine.source} has both (CPUs and GPUs of its nodes: {nodes}). {FOR_EVER}",
             "Lower resources.num_cpus or resources.num_gpus.",
         )
+
+
+def _settings_that_fit(spec: SweepSpec, most: int) -> str:
+    """Return which settings to lower, and how far, for a trial that takes so many CPUs at most."""
+    runners, found = spec.resources.num_env_runners, []
+    if spec.resources.num_cpus is not None:
+        found.append(f"resources.num_cpus to at most {most}")
+    # Each needs a CPU, beside the trial's own process, also where num_cpus asks for the CPUs.
+    if 1 + runners > most:
+        found.append(f"resources.num_env_runners to at most {most - 1}")
+    return " and ".join(found)

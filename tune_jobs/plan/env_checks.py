@@ -105,10 +105,10 @@ def _check_constant_actions(spec: SweepSpec, env: EnvInfo, hyperparams: Sequence
         if not isinstance(values, ConstantHyperparams):
             continue
         if problem := action_problem(values.action, cast("Any", env.action_space)):
-            raise SpecError(
-                f"{place}: {problem} ({env.env_id}: {env.action_space}).",
-                f"Set {place} to one of the actions, such as --set hyperparams.action={_some_action(env)}.",
-            )
+            hint = f"Set {place} to one of the actions, such as --set {place}={_some_action(env)}."
+            if "action" in spec.space:
+                hint = f"Let {place} give only actions that there are, such as {_some_action(env)}."
+            raise SpecError(f"{place}: {problem} ({env.env_id}: {env.action_space}).", hint)
 
 
 def _some_action(env: EnvInfo) -> str:

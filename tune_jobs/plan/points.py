@@ -34,6 +34,8 @@ def num_points_of(spec: SweepSpec, chosen_points: Sequence[ChosenPointRecord] = 
 
 def repeated_points_notes(spec: SweepSpec) -> list[str]:
     """Return a note if points of a sweep must be the same as others, which then count as settings of their own."""
+    if spec.scheduler.is_population:
+        return []
     if (
         spec.search.type == "random"
         and spec.num_samples > 1
@@ -41,8 +43,6 @@ def repeated_points_notes(spec: SweepSpec) -> list[str]:
     ):
         repeats = f"The space has no random domain, so num_samples {spec.num_samples} repeats every point"
         return [f"{repeats}; seeds_per_point does that and averages over the seeds."]
-    if spec.scheduler.is_population:
-        return []
     again = "; seeds_per_point trains each again, and averages over the seeds."
     num_tried = num_points_of(spec)
     num_different = _num_different(spec.space, num_tried)

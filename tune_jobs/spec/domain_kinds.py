@@ -43,7 +43,7 @@ WholeNumber = Annotated[int, BeforeValidator(_refuse_coercion)]
 
 def text_of(value: Any) -> str:
     """Return a text that is equal for values that mean the same: 2e4 is 20000, [64] is 64, but true is not 1."""
-    return json.dumps(_in_one_form(value))
+    return json.dumps(_in_one_form(value), default=repr)
 
 
 def _in_one_form(value: Any) -> Any:

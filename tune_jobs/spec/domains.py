@@ -68,7 +68,7 @@ def _check_shape(value: Any) -> Any:
         return value
     if isinstance(value, list | tuple):
         raise ValueError(  # noqa: TRY004 - as above
-            f"{value!r} is a bare list: write {{grid: {list(value)!r}}} to try each of its values"
+            f"{value!r} is a bare list: write {{grid: {list(value) or '[...]'}}} to try each of its values"
         )
     if not isinstance(value, Mapping):
         raise ValueError(  # noqa: TRY004 - as above

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tune_jobs.spec.domain_kinds import Number, WholeNumber
 
@@ -18,6 +19,17 @@ NameText = Annotated[str, Field(min_length=1)]
 
 
 class Section(BaseModel):
-    """A part of a sweep: it cannot be changed, and refuses unknown fields."""
+    """A part of a sweep: it cannot be changed, and refuses unknown fields. A field that is null is as if left out."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    NEVER_EMPTY: ClassVar[frozenset[str]] = frozenset()
+    """Fields that null is refused for: it may be meant as no limit, which the default is not."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _empty_is_left_out(cls, data: Any) -> Any:
+        # In YAML a field without a value is null, and so is a section whose lines are all commented out.
+        if not isinstance(data, Mapping):
+            return data
+        kept = {*(data.keys() - cls.model_fields.keys()), *cls.NEVER_EMPTY}
+        return {key: value for key, value in data.items() if value is not None or key in kept}

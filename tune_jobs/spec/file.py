@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -17,6 +17,7 @@ from policies.errors import CheckpointError, SpecError, shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from policies.suggestions import did_you_mean
 from tune_jobs.spec.domains import Domain
+from tune_jobs.spec.fields import Section
 from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
 from tune_jobs.spec.sections import AboutSpec
@@ -188,12 +189,21 @@ def json_schema() -> dict[str, Any]:
     properties["objective"]["anyOf"] = [texts, pair, mapping]
     definitions["ObjectiveSpec"]["properties"]["type"] |= {"enum": texts["enum"]}
     definitions["EnvSpec"]["properties"]["atari"]["anyOf"].append({"type": "boolean"})
-    for name in properties.keys() - {*schema["required"], "hyperparams", "space"}:
-        # A section whose lines are all commented out is null.
-        told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}
-        properties[name] = {"anyOf": [properties[name], {"type": "null"}], **told}
+    for kind in Section.__subclasses__():
+        if (inner := definitions.get(kind.__name__)) is not None:
+            _let_be_empty(inner["properties"], {*inner.get("required", ()), *kind.NEVER_EMPTY})
+    _let_be_empty(properties, (*schema["required"], "hyperparams", "space"))
     whole: dict[str, Any] = _with_limits({**schema, "title": "tune-jobs sweep file", "allOf": rules})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | whole
+
+
+def _let_be_empty(properties: dict[str, Any], others: Collection[str]) -> None:
+    """Let the fields of a section be null, as those without a value are in YAML, but for some others."""
+    for name in properties.keys() - set(others):
+        if {"type": "null"} in properties[name].get("anyOf", ()):
+            continue
+        told = {key: properties[name].pop(key) for key in ("description", "default") if key in properties[name]}
+        properties[name] = {"anyOf": [properties[name], {"type": "null"}], **told}
 
 
 _LIMITS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}

@@ -12,6 +12,7 @@ from typing import Any
 
 from analysis.records import TRAINING_LENGTH
 from policies.errors import shortened
+from tune_jobs.spec.domain_kinds import text_of
 from tune_jobs.spec.domains import DOMAIN_KINDS
 
 _NUMBERS = re.compile(r"[\[(]? ?\d{1,9}(?:(?:, ?| ?x ?| )\d{1,9})*,? ?[\])]?")
@@ -42,7 +43,8 @@ def text_of_several(name: str, value: Any, is_allowed: Callable[[Any], bool]) ->
     if isinstance(value, Mapping) and len(value) == 1 and next(iter(value)) in DOMAIN_KINDS:
         return f"{shortened(value)} is a domain, not one value: write it as space.{name}"
     if isinstance(value, list | tuple) and len(value) > 1 and all(map(is_allowed, value)):
-        return f"{shortened(value)} is a list of values: write {{grid: {_written(value)}}} as space.{name} {_TO_TRY}"
+        grid = f"{{grid: {_written(_once(value))}}}"
+        return f"{shortened(value)} is a list of values: write {grid} as space.{name} {_TO_TRY}"
     return None
 
 
@@ -50,12 +52,10 @@ def text_of_no_domain(name: str, value: Any) -> str | None:
     """Return how to write a domain in the place of a list or of one value; None: it is neither."""
     if isinstance(value, list | tuple) and value:
         if name == "hidden_sizes" and all(type(size) is int for size in value):
-            each = _written([[size] for size in value])
-            return (
-                f"{shortened(value)} is a bare list: write {{grid: {each}}} to try each as one layer, or "
-                f"{{grid: [{_written(value)}]}} for one network of {_layers(len(value))}"
-            )
-        return f"{shortened(value)} is a bare list: write {{grid: {_written(value)}}} {_TO_TRY}"
+            network = f"{{grid: [{_written(value)}]}} for one network of {_layers(len(value))}"
+            each = f"{{grid: {_written([[size] for size in value])}}} to try each as one layer, or "
+            return f"{shortened(value)} is a bare list: write {'' if _repeats(value) else each}{network}"
+        return f"{shortened(value)} is a bare list: write {{grid: {_written(_once(value))}}} {_TO_TRY}"
     if isinstance(value, int | float) and not isinstance(value, bool):
         where = f"as {name}" if name == TRAINING_LENGTH else "under hyperparams"
         return f"{value!r} is one value: fix it {where}, or write {{grid: [{value!r}]}}"
@@ -69,7 +69,7 @@ def text_of_no_list(name: str, value: Any) -> str | None:
         if len(sizes) == 1:
             return f"{text}: write {sizes!r}"
         network = f"[{sizes!r}] for one network of {_layers(len(sizes))}"
-        return f"{text}: write {sizes!r} to try each as one layer, or {network}"
+        return f"{text}: write {'' if _repeats(sizes) else f'{sizes!r} to try each as one layer, or '}{network}"
     if isinstance(value, bool):
         return f"{text}: write [{str(value).lower()}]"
     return f"{text}: write [{value!r}]" if isinstance(value, int | float) else None
@@ -78,6 +78,19 @@ def text_of_no_list(name: str, value: Any) -> str | None:
 def _numbers_in(text: str) -> list[int] | None:
     """Return the whole numbers of a text such as "64, 64" or "64x64"; None: there is more in it, or nothing."""
     return [int(number) for number in re.findall(r"\d+", text)] if _NUMBERS.fullmatch(text.strip()) else None
+
+
+def _once(values: Sequence[Any]) -> list[Any]:
+    """Return values as a grid may list them, which is each once, whatever its form."""
+    known: dict[str, Any] = {}
+    for value in values:
+        known.setdefault(text_of(value), value)
+    return list(known.values())
+
+
+def _repeats(sizes: Sequence[int]) -> bool:
+    """Whether a size is there twice, as it may be in a network, but not among values to try."""
+    return len(_once(sizes)) < len(sizes)
 
 
 def _written(values: Sequence[Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Any, get_args, get_origin
@@ -9,6 +10,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from analysis.records import TRAINING_LENGTH
+from analysis.wording import is_number
 from policies.errors import shortened
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from policies.suggestions import did_you_mean
@@ -19,7 +21,7 @@ from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.layers import LayersFields
 from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
 from tune_jobs.spec.problems import Problem
-from tune_jobs.spec.sections import NAME_RULE, SweepFields
+from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
 from tune_jobs.spec.slips import text_of_no_space
 
 
@@ -89,9 +91,10 @@ def _from_detail(detail: Detail) -> Problem:
     if detail["type"] == "extra_forbidden":
         return Problem(path, _unknown_key(location))
     if detail["type"] == "missing":
-        options = {"algorithm": "ppo or dqn", "env": "a Gymnasium id such as CartPole-v1"}.get(path, "")
+        env_id = "a Gymnasium id such as CartPole-v1"
+        options = {"algorithm": "ppo or dqn", "env": env_id, "env.id": env_id}.get(path, "")
         return Problem(path, f"is missing{f': give {options}' if options else ''}")
-    if (written := _in_space(location, detail) or _of_one_word(detail)) is not None:
+    if (written := _in_space(location, detail) or _of_one_word(detail) or _of_a_number(location, detail)) is not None:
         return Problem(path, written)
     if path in _FORMS and detail["type"] != "value_error":
         return Problem(path, f"{shortened(detail['input'])} is not allowed: {_FORMS[path]}")
@@ -116,6 +119,19 @@ def _of_one_word(detail: Detail) -> str | None:
     """Return what to write where a mapping has become one word for want of a space; None: this is not the mistake."""
     spaced = text_of_no_space(detail["input"]) if detail["type"] in ("dict_type", "model_type") else None
     return None if spaced is None else f"{shortened(detail['input'])} is one word: {spaced}"
+
+
+def _of_a_number(location: Sequence[int | str], detail: Detail) -> str | None:
+    """Return what to write where the name of a sweep is read as a number; None: this is not the mistake."""
+    number = detail["input"]
+    if (
+        location[:1] not in (["name"], ["prior"])
+        or not is_number(number)
+        or not re.fullmatch(NAME_PATTERN, str(number))
+    ):
+        return None
+    text = f"'{number}'"
+    return f'{number} is a number: put it in quotes, {text}, and on a command line in two pairs, "{text}"'
 
 
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:
@@ -179,9 +195,15 @@ def _in_braces(name: str, model: type[BaseModel]) -> str | None:
     if not dot:
         return f"{head}: ..."
     if inner is dict:  # of names that are a user's own, or may have a dot, such as stop.num_env_steps in the space
-        return f"{head}: {{{rest}: ...}}"
+        return f"{head}: {{{_in_domain(rest) if head == 'space' else f'{rest}: ...'}}}"
     written = _in_braces(rest, inner) if isinstance(inner, type) and issubclass(inner, BaseModel) else None
     return None if written is None else f"{head}: {{{written}}}"
+
+
+def _in_domain(name: str) -> str:
+    """Return a dotted name below the space as a mapping: `lr: {loguniform: ...}`."""
+    searched, _, inner = name.rpartition(".")
+    return f"{searched}: {{{inner}: ...}}" if searched and inner in (*DOMAIN_KINDS, "when") else f"{name}: ..."
 
 
 def _other_place(name: str) -> str:

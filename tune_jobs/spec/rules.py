@@ -108,14 +108,26 @@ def _cost_notes(spec: SweepFields) -> list[str]:
     """Return the note on a cost in which settings can't differ."""
     if spec.objective.cost is None:
         return []
-    if TRAINING_LENGTH in spec.space or (spec.stop.training_return, spec.stop.evaluation_return) != (None, None):
+    if TRAINING_LENGTH in spec.space or _differ_in_length(spec):
         return []
+    # A scheduler that compares trials that have come equally far refuses lengths of their own.
+    search = f"search their length, as in space: {{{TRAINING_LENGTH}: {{choice: [20_000, 50_000]}}}}, or "
     text = (
-        "objective asks for env_steps, but all trainings are to be as long: search their length, as in space: "
-        f"{{{TRAINING_LENGTH}: {{choice: [20_000, 50_000]}}}}, or end them at a goal (stop.training_return, "
+        "objective asks for env_steps, but all trainings are to be as long: "
+        f"{'' if spec.scheduler.waits_for_others else search}end them at a goal (stop.training_return, "
         "stop.evaluation_return)."
     )
     return [text]
+
+
+def _differ_in_length(spec: SweepFields) -> bool:
+    """Whether trainings end where they don't all have as many env steps: at a goal, or by another count."""
+    stop = spec.stop
+    if (stop.training_return, stop.evaluation_return, stop.num_episodes) != (None, None, None):
+        return True
+    is_capped = stop.num_iterations != type(stop).model_fields["num_iterations"].default
+    of_an_iteration = "train_batch_size" if spec.algorithm == "ppo" else "env_steps_per_iteration"
+    return is_capped and of_an_iteration in spec.space
 
 
 def check_extendable(spec: SweepFields, num_samples: int) -> None:

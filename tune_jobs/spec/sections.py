@@ -6,7 +6,7 @@ Rules for several fields together are in `tune_jobs.spec.rules`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -115,6 +115,8 @@ class EnvSpec(Section):
 class StopSpec(Section):
     """When a trial ends: at whichever limit it reaches first. Three caps always apply, so nothing runs forever."""
 
+    NEVER_EMPTY: ClassVar[frozenset[str]] = frozenset({"num_env_steps", "num_iterations", "time_s"})
+
     training_return: Number | None = Field(
         None, description="End when the mean return of the last 100 whole training episodes reaches this."
     )
@@ -189,6 +191,8 @@ class EvaluationSpec(Section):
 
 class CheckpointSpec(Section):
     """Which checkpoints are kept. The best and the latest always are."""
+
+    NEVER_EMPTY: ClassVar[frozenset[str]] = frozenset({"keep"})
 
     every_iterations: PositiveWhole = Field(10, description="Save at each multiple of this, and at the end.")
     keep: NonNegativeWhole = Field(2, description="How many of the newest to keep besides the best and the latest.")
@@ -273,7 +277,8 @@ class SweepFields(Section):
     name: str | None = Field(
         None,
         pattern=f"^{NAME_PATTERN}$",
-        description="Name of the sweep and of its folder; null: the file's or preset's, with a number if it is taken.",
+        description="Name of the sweep and of its folder, other than random and constant, the baselines' names; null: "
+        "the file's or preset's, with a number if it is taken.",
     )
     about: Annotated[AboutSpec, _from_text("title")] = Field(
         default_factory=AboutSpec, description="What the sweep is for: a text, or a mapping. The report shows it."

@@ -19,6 +19,7 @@ from pydantic import (
 
 from analysis.wording import counted
 from policies.errors import SpecError
+from policies.portable.file import BASELINE_KINDS
 from tune_jobs.spec.condition_problems import condition_problems
 from tune_jobs.spec.engines import find_engine
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
@@ -34,12 +35,8 @@ class SweepSpec(SweepFields):
 
     @model_validator(mode="before")
     @classmethod
-    def _empty_sections_are_defaults(cls, data: Any) -> Any:
-        # In YAML a section whose lines are all commented out is null.
-        if not isinstance(data, Mapping):
-            return data
-        given = {key: value for key, value in data.items() if value is not None or key not in cls.model_fields}
-        return with_longest(given)
+    def _stops_at_the_longest(cls, data: Any) -> Any:
+        return with_longest(data) if isinstance(data, Mapping) else data
 
     @model_validator(mode="wrap")
     @classmethod
@@ -62,14 +59,24 @@ class SweepSpec(SweepFields):
 
 
 def check_sweep_name(name: str) -> str:
-    """Return a sweep's name if it is allowed as a folder's name.
+    """Return the name of a new sweep if it is allowed as a folder's name, and names no baseline policy.
 
     Raises:
         SpecError: It is not allowed.
     """
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise SpecError(f"The sweep name {name!r} is not allowed.", f"Use {NAME_RULE}.")
+    if name in BASELINE_KINDS:
+        raise SpecError(
+            f"The sweep name {name!r} is not allowed: for `tune-jobs evaluate` and `video` it is the {name} policy.",
+            f"Use another, such as {name_after(name)!r}.",
+        )
     return name
+
+
+def name_after(stem: str) -> str:
+    """Return the name of a new sweep that is called after its file or preset, which may be called as a baseline is."""
+    return f"{stem}-sweep" if stem in BASELINE_KINDS else stem
 
 
 def _section_problems(spec: SweepFields) -> list[Problem]:

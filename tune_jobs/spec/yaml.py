@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import yaml
@@ -150,6 +151,13 @@ class _Loader(yaml.SafeLoader):
                 node.value[index] = named, value
         return node
 
+    @override
+    def compose_sequence_node(self, anchor: Any) -> yaml.SequenceNode:
+        """Compose a list; a number with commas in it is not taken for several."""
+        node: yaml.SequenceNode = super().compose_sequence_node(anchor)
+        _refuse_commas_in_list(node)
+        return node
+
     def _extent(self, node: yaml.Node) -> _Extent:
         if isinstance(node, yaml.ScalarNode):
             return _Extent(1, len(node.value), 1)
@@ -197,6 +205,26 @@ def _refuse_commas(node: yaml.MappingNode) -> None:
             hint = f"Write {'.'.join(parts)} with a point."
         read = " and ".join(parts)
         raise _error(value, f"{','.join(parts)} is {read} here, as commas separate what is in braces", hint)
+
+
+def _refuse_commas_in_list(node: yaml.SequenceNode) -> None:
+    """Refuse `[20,000, 50,000]`, which YAML reads as four numbers; `[1,200]` may be two."""
+    parts: list[yaml.Node] = []
+    for item in node.value if node.flow_style else ():
+        if parts and _is_plain(item, "[0-9]{3}") and item.start_mark.index == parts[-1].end_mark.index + 1:
+            parts.append(item)
+            continue
+        _refuse_groups(parts)
+        parts = [item] if _is_plain(item, r"[-+]?[0-9]{1,3}") else []
+    _refuse_groups(parts)
+
+
+def _refuse_groups(parts: Sequence[yaml.Node]) -> None:
+    """Refuse what looks like the groups of one number if one begins with 0, which has two meanings by itself."""
+    if any(part.tag == _TWO_MEANINGS for part in parts[1:]):
+        texts = [part.value for part in parts]
+        problem = f"{','.join(texts)} is {' and '.join(texts)} here, as commas separate what is in brackets"
+        raise _error(parts[0], problem, f"Write {''.join(texts)} or {'_'.join(texts)}.")
 
 
 def _is_plain(node: yaml.Node, pattern: str) -> bool:
