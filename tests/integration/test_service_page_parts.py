@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from live_service import Live
 from page_browser import IN_A_BROWSER, Page
 
 pytestmark = IN_A_BROWSER
@@ -53,6 +54,8 @@ TABLE = """
       return node.dataset.key ?? node.className;
     });
 """
+
+STATES = "return given.map((sweep) => [module.stateOf(sweep).word, module.stateReason(sweep), module.isDone(sweep)]);"
 
 
 def run_module(page: Page, name: str, script: str, given: Any) -> Any:
@@ -105,6 +108,44 @@ def test_the_focus_goes_with_a_row_and_to_the_table_where_it_leaves(page: Page) 
     shown = [["t0001", "t0002", "t0003"], ["t0003", "t0001"], ["t0001", "t0003"], ["t0001"]]
     told = run_module(page, "trial_table", TABLE, shown)
     assert told == ["t0003", "t0003", "t0003", "scroller"]
+
+
+def test_what_a_job_says_of_its_sweep_holds_until_somebody_resumes_it_elsewhere(page: Page) -> None:
+    def sweep(ended_at: float, outcome: str, **job: Any) -> dict[str, Any]:
+        told = {"state": "ended", "outcome": outcome, "ended_at": 200, "finish_failed": None, "message": None, **job}
+        return {"state": "completed", "alive": False, "waiting": None, "ended_at": ended_at, "job": told}
+
+    no_best = {"message": "No best policy: it broke.", "finish_failed": True}
+    died = {"message": "The process that ran the sweep died 5 times."}
+    told = run_module(page, "states", STATES, [
+        sweep(190, "completed", **no_best), sweep(900, "completed", **no_best),
+        sweep(190, "completed", message="1 of 4 trials failed.", finish_failed=False),
+        sweep(190, "failed", **died), sweep(900, "failed", **died),
+        sweep(190, "stopped"), {**sweep(190, "completed"), "job": None},
+    ])  # fmt: skip
+    assert told == [
+        ["completed", "No best policy: it broke.", False], ["completed", "", True],
+        ["completed", "1 of 4 trials failed.", True],
+        ["failed", "The process that ran the sweep died 5 times.", False], ["completed", "", True],
+        ["completed", "", True], ["completed", "", True],
+    ]  # fmt: skip
+
+
+def test_a_sweep_without_a_policy_says_why_and_can_be_resumed(page: Page, live: Live) -> None:
+    name, queue = "pendulum-no-space", live.service.queue
+    page.open(f"#/sweeps/{name}")
+    page.button("More")
+    resume = "return [...document.querySelectorAll('.actions button')].find((node) => node.textContent === 'Resume')"
+    assert not page.run(f"{resume}.checkVisibility()")
+    job = queue.begin(name, "drive", {}, owner="ann", num_cpus=1.0)[0]
+    try:
+        queue.end(job.id, "completed", "No best policy: it broke.", finish_failed=True)
+        page.open(f"#/sweeps/{name}")
+        page.says(".notice", "No best policy: it broke.")
+        assert page.button("Resume", ".actions").is_displayed()
+        assert page.violations() == []
+    finally:
+        queue.remove_sweep(name)
 
 
 def test_a_dialog_stays_when_a_selection_in_it_ends_outside(page: Page) -> None:

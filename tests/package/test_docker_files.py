@@ -197,6 +197,14 @@ def test_the_service_is_asked_for_what_it_has_and_stopped_after_sweeps_have_save
     assert any("['postgresql']" in rest for rest in rest_of("RUN"))
 
 
+def test_the_service_is_stopped_before_its_database_and_starts_without_one(compose: dict[str, Any]) -> None:
+    needs = dict(compose["services"]["service"]["depends_on"])
+    assert needs.pop("database") == {"condition": "service_healthy", "required": False}
+    assert needs == {"head": {"condition": "service_healthy"}}
+    # Which Compose reads since then.
+    assert "Docker Compose 2.20.2 or newer" in (DOCKER / "README.md").read_text()
+
+
 def test_the_health_check_of_the_service_says_what_is_ready(compose: dict[str, Any], tmp_path: Path) -> None:
     kind, python, *test = compose["services"]["service"]["healthcheck"]["test"]
     assert (kind, python) == ("CMD", "python")

@@ -43,7 +43,9 @@ def _done(request: Mapping[str, Any]) -> Any:
         state = "interrupted" if interrupted else "completed"
         store.write_record(record.model_copy(update={"state": state}))
         _note(store, told | {"what": "stopped" if interrupted else "end"})
-    return SimpleNamespace(interrupted=interrupted, trials=[], notes=(), finish_failed=bool(how.get("finish_failed")))
+    return SimpleNamespace(
+        interrupted=interrupted, trials=[], notes=(), why_no_best=None, finish_failed=bool(how.get("finish_failed"))
+    )
 
 
 def _note(store: SweepStore, line: Mapping[str, Any]) -> None:

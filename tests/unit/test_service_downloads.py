@@ -90,7 +90,8 @@ def test_what_can_be_downloaded_is_listed_and_can_be(site: Live) -> None:
 
 
 def test_a_sweep_that_has_made_nothing_says_so(live: Live) -> None:
-    make_sweep_folder(live.storage / "mine")
+    store = make_sweep_folder(live.storage / "mine")
+    store.write_record(store.read_record().model_copy(update={"state": "interrupted"}))
     assert get(live, "/files").json() == []
     assert "written when the sweep has ended" in get(live, "/report/index.html").json()["hint"]
     assert "has no report yet" in get(live, "/report/").json()["detail"]
@@ -98,6 +99,16 @@ def test_a_sweep_that_has_made_nothing_says_so(live: Live) -> None:
         assert get(live, path).json()["hint"] == "It is chosen when the sweep has ended."
     for path in ("/report/", "/films/after_mp4", "/policy", "/policy/policy.json", "/best"):
         problem(get(live, path), 404)
+
+
+def test_of_a_sweep_that_has_ended_no_policy_is_promised(live: Live) -> None:
+    store = make_sweep_folder(live.storage / "mine")
+    for path in ("/best", "/policy", "/policy/policy.json", "/play"):
+        assert "has ended, and has no best policy" in problem(get(live, path), 404)
+        assert get(live, path).json()["hint"] == "Resume it: then one is chosen, or it is said why not."
+    with store.lock():
+        # Its trials have ended, and one is being chosen.
+        assert get(live, "/best").json()["hint"] == "It is chosen when the sweep has ended."
 
 
 def test_a_policy_that_was_chosen_before_its_sweep_was_extended_is_not_its_best(live: Live, store: SweepStore) -> None:

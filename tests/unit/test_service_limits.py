@@ -44,3 +44,18 @@ def test_too_many_trials_are_not_even_planned(
         found = problem(client.post(f"/api/v1/{path}", json={"spec": spec}), 422)
         assert f"The sweep has {number} trials; here a sweep may have at most 12." in found["detail"]
     assert planned == [12]
+
+
+@pytest.mark.parametrize("path", ["plans", "sweeps"])
+def test_of_too_many_points_none_is_looked_at(
+    client: TestClient, service: Service, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    def look(*_: Any, **__: Any) -> None:
+        raise AssertionError("a point was looked at")
+
+    monkeypatch.setattr("tune_jobs.search.given_points.checked_point", look)
+    object.__setattr__(service.config.limits, "trials", 12)
+    points = [{"lr": 1e-3 * number} for number in range(1, 6)]
+    spec = FAKE | {"space": {"lr": {"uniform": [1e-4, 1e-2]}}, "seeds_per_point": 2, "num_samples": 2, "points": points}
+    found = problem(client.post(f"/api/v1/{path}", json={"spec": spec}), 422)
+    assert "The sweep has 14 trials; here a sweep may have at most 12." in found["detail"]

@@ -6,6 +6,7 @@ import json
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -318,6 +319,18 @@ def test_sqlite_keeps_what_it_has_answered(tmp_path: Path) -> None:
         found = {name: connection.execute(text(f"PRAGMA {name}")).scalar() for name in ("journal_mode", "synchronous")}
     engine.dispose()
     assert found == {"journal_mode": "wal", "synchronous": 2}
+
+
+@pytest.mark.parametrize("name", ["what?", "50%25 runs", "100%", "{a}&b=c#d"])
+def test_a_file_may_have_any_letters(name: str, tmp_path: Path) -> None:
+    file = tmp_path / "out" / name / "service.db"
+    file.parent.mkdir(parents=True)
+    engine = open_database(sqlite_url(file))
+    add(Queue(engine), "a")
+    engine.dispose()
+    with closing(sqlite3.connect(file)) as connection:
+        assert connection.execute("SELECT COUNT(*) FROM jobs").fetchone() == (1,)
+    assert [found for found in (tmp_path / "out").rglob("*") if found.is_file()] == [file]
 
 
 def test_a_reader_is_let_in_while_another_process_writes(tmp_path: Path) -> None:

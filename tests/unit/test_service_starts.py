@@ -7,11 +7,17 @@ from typing import Any
 
 import pytest
 from sqlalchemy.exc import OperationalError
+from store_parts import make_trial
+from synthetic_sweep import make_sweep_record
 from test_service_supervisor import Place, place  # noqa: F401 (a fixture)
 
+from policies.errors import fit
 from tests.narrowing import present
+from tune_jobs.service import driver
 from tune_jobs.service import supervisor as module
+from tune_jobs.service.job_files import Ended
 from tune_jobs.service.supervisor import Supervisor
+from tune_jobs.sweeps.outcome import SweepResult
 
 # ruff: noqa: F811 - fixtures are named as arguments
 
@@ -80,3 +86,16 @@ def test_whether_what_follows_the_trials_failed_is_kept(place: Place, service: S
     ended = [(job.sweep, job.finish_failed) for job in place.until_all_end()]
     assert ended == [("whole", False), ("no film", True), ("broken", None)]
     assert sorted((job.sweep, job.finish_failed) for job in place.ended) == sorted(ended)
+
+
+@pytest.mark.parametrize("num_failed", [0, 1])
+def test_a_job_says_why_its_sweep_has_no_best_policy(monkeypatch: pytest.MonkeyPatch, num_failed: int) -> None:
+    why = "The environment MyEnv-v0 raised ValueError: bad \udcf6, while the policy was confirmed."
+    trials = [make_trial(index, status="failed" if index < num_failed else "completed") for index in range(4)]
+    record = make_sweep_record("mine", "ppo", "CartPole-v1", [], 1)
+    notes = ("No report: no space is left.",)
+    result = SweepResult("mine", record, trials, why_no_best=why, finish_failed=True, notes=notes)
+    monkeypatch.setattr(driver, "_done", lambda _: result)
+    said = f"No report: no space is left. No best policy: {fit(why)}"
+    message = f"1 of 4 trials failed. {said}" if num_failed else said
+    assert driver._ended({"attempt": 2}) == Ended(attempt=2, outcome="completed", message=message, finish_failed=True)

@@ -144,3 +144,12 @@ def test_a_name_that_its_number_would_make_too_long_is_refused(client: TestClien
     assert f"The sweep would be called '{'a' * 99}-2', as '{'a' * 99}' is taken" in answer.json()["detail"]
     assert "Give another name" in answer.json()["hint"]
     assert len(service.queue.jobs()) == len(service.storage.sweeps()) == 3
+
+
+def test_no_sweep_is_called_as_a_baseline_is(client: TestClient) -> None:
+    answer = client.post("/api/v1/sweeps", json={"spec": FAKE, "default_name": "random"})
+    assert (answer.status_code, answer.json().get("sweep")) == (201, "random-sweep")
+    for given in ({"spec": FAKE, "name": "constant"}, {"spec": {**FAKE, "name": "constant"}}):
+        answer = client.post("/api/v1/sweeps", json=given)
+        assert answer.status_code == 422, answer.text
+        assert "The sweep name 'constant' is not allowed" in answer.json()["detail"]

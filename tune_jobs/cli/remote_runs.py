@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
@@ -16,7 +17,9 @@ from tune_jobs.cli.base import losing_what_nobody_reads, stdout_for
 from tune_jobs.cli.remote import told_here
 from tune_jobs.cli.server import Server
 from tune_jobs.client.answers import Job, Summary
+from tune_jobs.client.problems import TooManyError
 from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
+from tune_jobs.service.jobs import NO_BEST
 
 if TYPE_CHECKING:
     from tune_jobs.client import Client
@@ -82,21 +85,39 @@ def _done(  # noqa: PLR0917 (all of them are one request)
     except KeyboardInterrupt:
         return _Left("Interrupted while it was being asked for.", f"See whether it is there: {server.program} list")
     name = shlex.quote(job.sweep)
+    status, stop = f"{server.program} status {name}", f"{server.program} stop {name}"
     try:
-        job = _followed(client, job, say)
+        with _telling(
+            f"{job.sweep} was submitted to {client.url}, and is no longer followed",
+            f"It goes on there: see {status}, and stop it with: {stop}",
+        ):
+            job = _followed(client, job, say)
     except KeyboardInterrupt:
         message = f"No longer followed; {job.sweep} goes on at {client.url}."
-        return _Left(message, f"Stop it with: {server.program} stop {name}")
+        return _Left(message, f"Stop it with: {stop}")
     if job.outcome == "failed":
         raise TuneJobsError(
             f"Sweep {job.sweep} failed at {client.url}: {job.message or 'nothing is known of why'}",
             f"Continue with: {server.program} resume {name}",
         )
+    ended, look = f"Sweep {job.sweep} has ended at {client.url}: {job.outcome}", f"See what came of it: {status}"
     try:
-        return _result(client, job)
+        with _telling(f"{ended}. Its result can't be had", look):
+            return _result(client, job)
     except KeyboardInterrupt:
-        message = f"Sweep {job.sweep} has ended at {client.url}: {job.outcome}."
-        return _Left(message, f"See what came of it: {server.program} status {name}")
+        return _Left(f"{ended}.", look)
+
+
+@contextlib.contextmanager
+def _telling(what: str, hint: str) -> Iterator[None]:
+    """Say what was done where a service does not answer any more: whoever asks for it again gets it twice."""
+    try:
+        yield
+    except NotFoundError:
+        # It was deleted meanwhile.
+        raise
+    except TuneJobsError as error:
+        raise error.again(f"{what}: {error.message}", hint) from error
 
 
 def _say_left(left: _Left, *, as_json: bool) -> int:
@@ -133,7 +154,22 @@ def _begun(client: Client, verb: str, arguments: Sequence[Any], options: dict[st
 
 def _followed(client: Client, job: Job, say: Callable[[str], None]) -> Job:
     """Say how far a job is until it has ended, and return it."""
-    began = told_at = time.monotonic()
+    began = time.monotonic()
+    try:
+        job = _watched(client, job, say, began)
+    except TooManyError:
+        # As many watch as may. It is asked now and then whether it has ended, as all may.
+        say(f"{job.sweep}: too many watch sweeps there; its end is waited for")
+        client.wait(job.sweep, job=job)
+        job = client.job(job.id)
+    if job.outcome in ("completed", "stopped"):
+        say(_line(client.sweep(job.sweep), time.monotonic() - began))
+    return job
+
+
+def _watched(client: Client, job: Job, say: Callable[[str], None], began: float) -> Job:
+    """Say how far a job is, as its events tell, and return it when it has ended."""
+    told_at = began
     state, seen = job.state, None
     say(f"{job.sweep}: {_STATES.get(state, state)}")
     for event, now in client.job_events(job):
@@ -146,8 +182,6 @@ def _followed(client: Client, job: Job, say: Callable[[str], None]) -> Job:
         elif state == "running" and seen is not None and time.monotonic() - told_at >= _LINE_INTERVAL_S:
             told_at = time.monotonic()
             say(_line(seen, told_at - began))
-    if job.outcome in ("completed", "stopped"):
-        say(_line(client.sweep(job.sweep), time.monotonic() - began))
     return job
 
 
@@ -172,12 +206,13 @@ def _line(seen: Summary, elapsed_s: float) -> str:
 def _result(client: Client, job: Job) -> dict[str, Any]:
     """Return what a launch on this machine returns, its paths as addresses."""
     name, is_whole = job.sweep, job.outcome == "completed"
-    best, trials, why = None, client.records(name), ""
+    best, trials, unchosen = None, client.records(name), None
     if is_whole:
         try:
             best = client.best(name)
         except NotFoundError as error:
-            why = str(error)
+            unchosen = str(error)
+    notes, why = _said(job, unchosen) if is_whole else ([], None)
     files = {file.path for file in client.files(name)} if is_whole else set()
     at = f"{client.url}/api/v1/sweeps/{quote(name)}"
     has_failed = any(trial.status == "failed" for trial in trials)
@@ -187,15 +222,30 @@ def _result(client: Client, job: Job) -> dict[str, Any]:
         "sweep": client.status(name).sweep,
         "trials": trials,
         "best": best,
-        "why_no_best": (job.message or why) if is_whole and best is None else None,
+        "why_no_best": why,
         "artifacts": {
             what: f"{at}/{path}" for what, path in _ARTIFACTS.items() if any(file.startswith(path) for file in files)
         },
         "interrupted": not is_whole,
-        "notes": [job.message] if is_whole and best is not None and job.message else [],
+        "notes": notes,
         "finish_failed": finish_failed,
         "exit_code": INTERRUPTED if not is_whole else 3 if has_failed or finish_failed else 0,
     }
+
+
+def _said(job: Job, unchosen: str | None) -> tuple[list[str], str | None]:
+    """Return the notes of a job that completed, and why its sweep has no best policy; None: it has one.
+
+    Args:
+        job: The job.
+        unchosen: What the service answers where it is asked for the best policy, and there is none; None: there is.
+    """
+    told, is_said, why = (job.message or "").partition(NO_BEST)
+    notes = [told.strip()] if told.strip() else []
+    if unchosen is None:
+        return notes, None
+    # Of an older service, the message is all that it says of it.
+    return (notes, why) if is_said else ([], told or unchosen)
 
 
 def _show(result: dict[str, Any], server: Server, *, as_json: bool) -> int:

@@ -35,12 +35,16 @@ class LostConnectionError(CannotRunError):
     """The connection was lost before the whole answer was there."""
 
 
+class TooManyError(CannotRunError):
+    """As many ask for it as may, such as those that watch sweeps, or this address has asked too often."""
+
+
 class ConflictError(CannotRunError):
     """It contradicts what the sweep does just now, such as resuming one that runs."""
 
 
 _BY_STATUS: dict[int, type[TuneJobsError]] = {
-    404: NotFoundError, 409: ConflictError, 422: SpecError, 500: TuneJobsError,
+    404: NotFoundError, 409: ConflictError, 422: SpecError, 429: TooManyError, 500: TuneJobsError,
 }  # fmt: skip
 
 

@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policies.envs.modules import allow_modules
-from policies.errors import CannotRunError, TuneJobsError
+from policies.errors import CannotRunError, TuneJobsError, fit, said_by
 from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
+from tune_jobs.service.jobs import NO_BEST
 from tune_jobs.store.urls import name_of_place, outer_place
 
 if TYPE_CHECKING:
@@ -139,12 +140,14 @@ def _ended(request: Mapping[str, Any]) -> Ended:
         return Ended(attempt=attempt, outcome="failed", message=str(error))
     except BaseException as error:  # noqa: BLE001 (it is told)
         traceback.print_exc()
-        return Ended(attempt=attempt, outcome="failed", message=f"{type(error).__name__}: {error}")
+        return Ended(attempt=attempt, outcome="failed", message=f"{type(error).__name__}: {said_by(error)}")
     if result.interrupted:
         return Ended(attempt=attempt, outcome="stopped")
     failed = [trial for trial in result.trials if trial.status == "failed"]
     told = [f"{len(failed)} of {len(result.trials)} trials failed."] if failed else []
-    message = " ".join([*told, *result.notes]) or None
+    told += result.notes
+    told += [] if result.why_no_best is None else [f"{NO_BEST}{result.why_no_best}"]
+    message = fit(" ".join(told)) or None
     return Ended(attempt=attempt, outcome="completed", message=message, finish_failed=result.finish_failed)
 
 

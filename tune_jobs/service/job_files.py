@@ -77,9 +77,14 @@ def remove_ended(folder: Path, open_uids: Collection[str], now: float) -> None:
                 path.unlink()
 
 
+def begun_jobs(folder: Path) -> list[JobFiles]:
+    """Return the files of those jobs that a driver runs, or ran."""
+    return [JobFiles(folder, path.stem) for path in sorted((folder / "jobs").glob("*.held"))]
+
+
 def held_jobs(folder: Path) -> list[Holder]:
     """Return the drivers that run now, as the files of all jobs say."""
-    holders = (JobFiles(folder, path.stem).holder() for path in sorted((folder / "jobs").glob("*.held")))
+    holders = (files.holder() for files in begun_jobs(folder))
     return [holder for holder in holders if holder is not None]
 
 
@@ -92,6 +97,7 @@ class JobFiles:
     """
 
     def __init__(self, folder: Path, uid: str) -> None:
+        self.uid = uid
         self._folder = folder / "jobs"
         self._lock = self._folder / f"{uid}.held"
         self._ended = self._folder / f"{uid}.json"

@@ -11,6 +11,8 @@ JobState = Literal["creating", "waiting", "running", "ended"]
 Outcome = Literal["completed", "failed", "stopped", "cancelled"]
 
 MAX_PRIORITY = 100
+NO_BEST = "No best policy: "
+"""Begins, in the message of a job that completed, why its sweep has no best policy: to the end of the message."""
 
 
 class Job(BaseModel):

@@ -17,8 +17,9 @@ from typing import Any
 from sqlalchemy import Connection, Engine, RowMapping, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from policies.errors import NotFoundError, SpecError
+from policies.errors import NotFoundError, SpecError, fit
 from tune_jobs.service.database.tables import jobs, submissions
+from tune_jobs.service.folder_names import check_for_job
 from tune_jobs.service.jobs import Job, JobState, Outcome, Verb
 
 
@@ -83,7 +84,9 @@ class Queue:
 
         Raises:
             KeyUsedError: The owner used the key for another request.
+            CheckpointError: The sweep's name is none that a job can have.
         """
+        check_for_job(sweep)
         row = {
             "uid": uuid.uuid4().hex, "sweep": sweep, "verb": verb, "arguments": dict(arguments), "owner": owner,
             "priority": priority, "num_cpus": num_cpus, "state": state, "num_attempts": 0, "stop_requested": False,
@@ -207,10 +210,9 @@ class Queue:
             finish_failed: Whether what follows the trials failed; None: they did not come to their end.
             at: When, in seconds since 1970; None: now.
         """
-        ended_at = self._now() if at is None else at
         values = {
-            "state": "ended", "outcome": outcome, "message": message, "finish_failed": finish_failed,
-            "ended_at": ended_at,
+            "state": "ended", "outcome": outcome, "message": None if message is None else fit(message),
+            "finish_failed": finish_failed, "ended_at": self._now() if at is None else at,
         }  # fmt: skip
         return self._change(job_id, values, ("waiting", "running"))
 

@@ -20,6 +20,7 @@ from tune_jobs.service.access.gate import Gate
 from tune_jobs.service.access.pruning import Pruning
 from tune_jobs.service.access.tokens import Tokens
 from tune_jobs.service.config import ServiceConfig
+from tune_jobs.service.database.holding import Hold, held
 from tune_jobs.service.database.opening import open_database
 from tune_jobs.service.derived import Derived
 from tune_jobs.service.events import Watch
@@ -71,77 +72,88 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
     """Open the database and run the queue for the block; sweeps that run at its end live on.
 
     Raises:
-        CannotRunError: Another service has this storage folder, it can't be written, the database can't be used, or
-            nobody could come in.
+        CannotRunError: Another service has this storage folder or the database, they can't be used, or nobody could
+            come in.
     """
-    with _alone(config.folder), served(config.place):
-        engine = open_database(config.database_url)
-        try:
-            gate = _gate(config, engine)
-            storage, queue, labels = open_storage(config.place), Queue(engine), Labels(engine)
-            statuses = Statuses(storage)
-            # A cluster shares its CPUs among the trials of all sweeps by itself.
-            num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
-            where = Surroundings(
-                config.working_folder, config.folder, config.address, num_cpus, config.modules, config.log_format,
-                config.wait_for_nodes,
-            )  # fmt: skip
-            metrics = Metrics()
-            watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
-            teller = Teller(
-                engine, config.targets, secret=config.webhook_secret, on_attempt=metrics.delivered, outages=gate.outages
+    with _alone(config.folder), served(config.place), _database(config) as (engine, hold):
+        gate = _gate(config, engine)
+        storage, queue, labels = open_storage(config.place), Queue(engine), Labels(engine)
+        statuses = Statuses(storage)
+        # A cluster shares its CPUs among the trials of all sweeps by itself.
+        num_cpus = float("inf") if config.address is not None else float(local_machine().num_cpus)
+        where = Surroundings(
+            config.working_folder, config.folder, config.address, num_cpus, config.modules, config.log_format,
+            config.wait_for_nodes,
+        )  # fmt: skip
+        metrics = Metrics()
+        watching = Watching(storage, statuses, queue, labels, config.limits.watchers)
+        teller = Teller(
+            engine, config.targets, secret=config.webhook_secret, on_attempt=metrics.delivered, outages=gate.outages
+        )
+        watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s, outages=gate.outages)
+
+        env_steps = EnvSteps()
+
+        def on_end(job: Job) -> None:
+            watch.ended(job)
+            metrics.job_ended(job)
+            with contextlib.suppress(TuneJobsError):
+                env_steps.saw(statuses.see(job.sweep))
+
+        submitter = Submitter(config, queue, storage)
+
+        def before_look() -> None:
+            hold.check()
+            submitter.settle()
+
+        supervisor = Supervisor(
+            queue, storage, where,
+            spare_idle_s=config.spare_idle_s, on_end=on_end, on_death=metrics.driver_died, outages=gate.outages,
+            settle=before_look,
+        )  # fmt: skip
+        metrics.add(
+            StateCollector(
+                queue=queue,
+                storage=storage,
+                statuses=statuses,
+                supervisor=supervisor,
+                watching=watching,
+                teller=teller,
+                env_steps=env_steps,
             )
-            watch = Watch(queue, statuses, teller, stuck_s=config.stuck_s, outages=gate.outages)
-
-            env_steps = EnvSteps()
-
-            def on_end(job: Job) -> None:
-                watch.ended(job)
-                metrics.job_ended(job)
-                with contextlib.suppress(TuneJobsError):
-                    env_steps.saw(statuses.see(job.sweep))
-
-            submitter = Submitter(config, queue, storage)
-            supervisor = Supervisor(
-                queue, storage, where,
-                spare_idle_s=config.spare_idle_s, on_end=on_end, on_death=metrics.driver_died, outages=gate.outages,
-                settle=submitter.settle,
-            )  # fmt: skip
-            metrics.add(
-                StateCollector(
-                    queue=queue,
-                    storage=storage,
-                    statuses=statuses,
-                    supervisor=supervisor,
-                    watching=watching,
-                    teller=teller,
-                    env_steps=env_steps,
-                )
+        )
+        pruning = Pruning(gate.audit, config.keep_audit_days)
+        with contextlib.ExitStack() as stack:
+            for part in (teller, watch, supervisor, pruning):
+                part.start()
+                stack.callback(part.close)
+            stack.callback(watching.close)
+            yield Service(
+                config=config,
+                engine=engine,
+                gate=gate,
+                storage=storage,
+                queue=queue,
+                labels=labels,
+                statuses=statuses,
+                storage_health=StorageHealth(storage),
+                submitter=submitter,
+                supervisor=supervisor,
+                watching=watching,
+                derived=Derived(storage, statuses),
+                metrics=metrics,
+                env_steps=env_steps,
             )
-            pruning = Pruning(gate.audit, config.keep_audit_days)
-            with contextlib.ExitStack() as stack:
-                for part in (teller, watch, supervisor, pruning):
-                    part.start()
-                    stack.callback(part.close)
-                stack.callback(watching.close)
-                yield Service(
-                    config=config,
-                    engine=engine,
-                    gate=gate,
-                    storage=storage,
-                    queue=queue,
-                    labels=labels,
-                    statuses=statuses,
-                    storage_health=StorageHealth(storage),
-                    submitter=submitter,
-                    supervisor=supervisor,
-                    watching=watching,
-                    derived=Derived(storage, statuses),
-                    metrics=metrics,
-                    env_steps=env_steps,
-                )
-        finally:
-            engine.dispose()
+
+
+@contextlib.contextmanager
+def _database(config: ServiceConfig) -> Iterator[tuple[Engine, Hold]]:
+    engine = open_database(config.database_url)
+    try:
+        with held(engine) as hold:
+            yield engine, hold
+    finally:
+        engine.dispose()
 
 
 def _gate(config: ServiceConfig, engine: Engine) -> Gate:

@@ -15,6 +15,7 @@ from analysis.records import TrialRecord
 from analysis.selection import score_trial
 from policies.envs.tallies import Reached
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
+from tune_jobs.service.folder_names import check_text
 from tune_jobs.service.storage_health import is_of_store
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
@@ -117,11 +118,7 @@ class Statuses:
             return self._see(name)
 
     def _see(self, name: str) -> Seen:
-        if not _is_text(name):
-            raise CheckpointError(
-                f"The name of the folder {name!a} is no text in UTF-8, so no page can link it.",
-                "Rename the folder.",
-            )
+        check_text(name)
         sweep = self._storage.sweep(name)
         with self._lock:
             lock = self._locks.setdefault(name, threading.Lock())
@@ -218,15 +215,6 @@ def _with(written: Trials, reached: Mapping[str, Reached]) -> Trials:
         return written
     records = tuple(as_reached(record, reached.get(record.trial_id)) for record in written.records)
     return replace(written, records=records)
-
-
-def _is_text(name: str) -> bool:
-    """Whether a name can be encoded: Linux takes any bytes for one, and Python makes halves of surrogates of them."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _read(sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Trials | None) -> Trials:

@@ -16,12 +16,11 @@ from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.points import num_trials_of
 from tune_jobs.plan.sweep_plan import SweepPlan, make_plan
-from tune_jobs.search.given_points import given_points
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.queue import Queue
 from tune_jobs.spec.file import find_preset, load_spec
-from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name
+from tune_jobs.spec.sweep_spec import SweepSpec, check_sweep_name, name_after
 from tune_jobs.spec.yaml import parse_yaml
 from tune_jobs.store.contract import Storage
 from tune_jobs.sweeps.drive import write_new
@@ -203,7 +202,7 @@ class Submitter:
             )
         limits = self._config.limits
         # Before it is planned: a request of somebody's must not have the service plan trials by the ten thousand.
-        num_trials = num_trials_of(spec, chosen_points=given_points(spec))
+        num_trials = num_trials_of(spec) + len(spec.points) * spec.seeds_per_point
         if num_trials > limits.trials:
             raise SpecError(
                 f"The sweep has {num_trials:,} trials; here a sweep may have at most {limits.trials:,}.",
@@ -234,7 +233,7 @@ class Submitter:
         wanted = _wanted(submission, spec)
         if wanted is not None:
             return self._storage.new_sweep(check_sweep_name(wanted)).name
-        name = stem = check_sweep_name(submission.default_name or submission.preset or "sweep")
+        name = stem = check_sweep_name(name_after(submission.default_name or submission.preset or "sweep"))
         number = 1
         while self._storage.is_taken(name):
             number += 1

@@ -9,13 +9,15 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from policies.errors import TuneJobsError
+from sqlalchemy.exc import SQLAlchemyError
+
+from policies.errors import TuneJobsError, fit
+from tune_jobs.service.draining import Draining
 from tune_jobs.service.job_files import JobFiles, held_jobs, remove_ended
 from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.outages import Outages
@@ -45,7 +47,8 @@ class Supervisor:
         on_death: Called when a driver has died before its job had ended.
         make_driver: Starts a driver process.
         outages: Where it is noted that the queue can't be looked at.
-        settle: Called before each look at the queue, to tell it what it could not be told before.
+        settle: Called before each look at the queue, to tell it what it could not be told before; if it raises, there
+            is no look.
     """
 
     def __init__(
@@ -74,7 +77,6 @@ class Supervisor:
         self._children: dict[int, Driver] = {}
         self._retry_at: dict[int, float] = {}
         self._not_started: dict[int, str] = {}
-        self._interrupted: set[int] = set()
         self._wake, self._end = threading.Event(), threading.Event()
         self._draining = threading.Event()
         self._thread = threading.Thread(target=self._run, name="queue", daemon=True)
@@ -98,12 +100,22 @@ class Supervisor:
         """
         self._draining.set()
         self.wake()
-        deadline = time.monotonic() + timeout_s
-        while self._queue.jobs("running") and time.monotonic() < deadline:
+        draining, deadline = Draining(self._where.service_folder), time.monotonic() + timeout_s
+        while (is_left := self._is_left(draining)) and time.monotonic() < deadline:
             time.sleep(TICK_S)
-        done = not self._queue.jobs("running")
         self.close()
-        return done
+        return not is_left
+
+    def _is_left(self, draining: Draining) -> bool:
+        """Whether a driver has not saved yet, or the queue doesn't have its job among those that wait again."""
+        if draining.ask():
+            return True
+        try:
+            return bool(self._queue.jobs("running"))
+        except SQLAlchemyError as error:
+            # What saved is in the jobs' files, too, which the next start looks at.
+            self._outages.failed(_LOOKING, error)
+            return False
 
     def close(self) -> None:
         """End the thread; drivers live on."""
@@ -173,13 +185,14 @@ class Supervisor:
                 if sweep.is_driven() and sweep.name not in ours:
                     continue
                 record = sweep.read_record()
+                if record.state in ("created", "running") and not _is_over(last.get(sweep.name), record.created_at):
+                    self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.unplanned_cpus)
             except TuneJobsError as error:
                 if is_of_store(self._storage, error):
                     raise
-                _log.warning("Sweep %s is left alone: %s", sweep.name, error, extra={"sweep": sweep.name})
-                continue
-            if record.state in ("created", "running") and not _is_over(last.get(sweep.name), record.created_at):
-                self._queue.begin(sweep.name, "drive", {}, owner="", num_cpus=self._where.unplanned_cpus)
+                # A folder's name may be no text.
+                name = fit(sweep.name)
+                _log.warning("Sweep %s is left alone: %s", name, error, extra={"sweep": name})
         self._remove_files()
 
     def _run(self) -> None:
@@ -237,8 +250,6 @@ class Supervisor:
                 sweep = self._sweep(job.sweep)
                 if sweep.is_driven() and not sweep.stop_requested():
                     sweep.request_stop()
-            elif self._draining.is_set():
-                self._interrupt(job, files)
             return
         ended = files.read_ended(job.num_attempts)
         if ended is not None and ended.outcome != "interrupted":
@@ -271,25 +282,11 @@ class Supervisor:
             )
             self._start(again)
 
-    def _interrupt(self, job: Job, files: JobFiles) -> None:
-        """Let a driver save and end, once."""
-        holder = files.holder()
-        if holder is None or job.id in self._interrupted:
-            return
-        self._interrupted.add(job.id)
-        if not files.is_open_in(holder.pid):
-            _log.warning(
-                "The driver of job %d (sweep %s) can't be asked to save: process %d is another one here. It runs on.",
-                job.id, job.sweep, holder.pid, extra=job.log_fields,
-            )  # fmt: skip
-            return
-        with contextlib.suppress(OSError):
-            # Not SIGTERM, as systemd may have sent that to all: a second one would end the trials before they save.
-            os.kill(holder.pid, signal.SIGHUP)
-
     def _finish(
         self, job: Job, outcome: Outcome, message: str | None = None, *, finish_failed: bool | None = None
     ) -> None:
+        # What processes print may have characters that no database takes.
+        message = None if message is None else fit(message)
         # First it is told: whoever is killed in between tells it twice, and not never.
         now = time.time()
         said = {"outcome": outcome, "message": message, "finish_failed": finish_failed}

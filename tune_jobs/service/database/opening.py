@@ -7,7 +7,7 @@ import logging
 import sqlite3
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, quote_plus
+from urllib.parse import quote, quote_plus, unquote
 
 from alembic import command
 from alembic.config import Config
@@ -29,8 +29,18 @@ _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
 def sqlite_url(file: Path) -> str:
-    """Return the URL of an SQLite database in a file."""
-    return f"sqlite:///{file}"
+    """Return the URL of an SQLite database in a file of any name, as `open_database` reads it."""
+    return f"sqlite:///{str(file).replace('%', '%25').replace('?', '%3F')}"
+
+
+def _parsed(url: str) -> URL:
+    """Return a URL in its parts, in which a file's name may have `?` as `%3F`, and `%` as `%25`."""
+    parsed = make_url(url)
+    # Before version 2.1, SQLAlchemy takes the name of a file as it is written.
+    is_decoded = make_url("sqlite:///%25").database == "%"
+    if is_decoded or parsed.get_backend_name() != "sqlite" or parsed.database is None:
+        return parsed
+    return parsed.set(database=unquote(parsed.database))
 
 
 def password_in(url: str) -> tuple[str, ...]:
@@ -46,13 +56,13 @@ def open_database(url: str) -> Engine:
     """Open a database, make its tables if it is new, and migrate it if it is of an older version.
 
     Args:
-        url: `sqlite:///FILE` or `postgresql://USER@HOST/NAME`.
+        url: `sqlite:///FILE`, with `?` as `%3F` and `%` as `%25`, or `postgresql://USER@HOST/NAME`.
 
     Raises:
         CannotRunError: The URL is wrong, or the database can't be reached, is damaged or of a newer version.
     """
     try:
-        parsed = make_url(url)
+        parsed = _parsed(url)
         if parsed.drivername in ("postgresql", "postgres"):
             parsed = parsed.set(drivername="postgresql+psycopg")
         told = parsed.render_as_string(hide_password=True)

@@ -16,6 +16,9 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
+MOST_LETTERS = 200
+"""Of the name of a sweep that has a job or a label; a sweep file allows fewer."""
+
 metadata = MetaData(
     naming_convention={
         "ix": "ix_%(column_0_label)s",
@@ -29,7 +32,7 @@ jobs = Table(
     metadata,
     Column("id", Integer, primary_key=True, autoincrement=True),
     Column("uid", String(32), nullable=False),
-    Column("sweep", String(200), nullable=False),
+    Column("sweep", String(MOST_LETTERS), nullable=False),
     Column("verb", String(20), nullable=False),
     Column("arguments", JSON, nullable=False),
     Column("owner", String(100), nullable=False),
@@ -64,7 +67,7 @@ submissions = Table(
 sweeps = Table(
     "sweeps",
     metadata,
-    Column("name", String(200), primary_key=True),
+    Column("name", String(MOST_LETTERS), primary_key=True),
     Column("owner", String(100), nullable=False),
     Column("note", Text, nullable=False),
     Column("tags", JSON, nullable=False),

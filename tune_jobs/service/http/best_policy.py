@@ -21,4 +21,9 @@ def no_best(sweep: Sweep) -> NotFoundError:
             f"The best policy of sweep {sweep.name} was chosen before the sweep was trained on.",
             "Resume it: then one is chosen anew.",
         )
+    if sweep.read_record().state == "completed" and not sweep.is_driven():
+        return NotFoundError(
+            f"Sweep {sweep.name} has ended, and has no best policy.",
+            "Resume it: then one is chosen, or it is said why not.",
+        )
     return NotFoundError(f"Sweep {sweep.name} has no best policy yet.", "It is chosen when the sweep has ended.")

@@ -5,7 +5,7 @@ import { askInDialog } from "./dialogs.js";
 import { el, toast } from "./dom.js";
 import { counted } from "./format.js";
 import { toldExtension, toldRace } from "./growth.js";
-import { isLive, isWaiting } from "./states.js";
+import { isDone, isLive, isWaiting } from "./states.js";
 import { mayChange } from "./who.js";
 
 // `state()` is the sweep's summary, `data` all that is known of it. `onDone()` is called after a change, `onGone()` after
@@ -217,7 +217,7 @@ export function makeActions({ state, data, alert, onDone, onGone }) {
       const live = isLive(sweep) || isWaiting(sweep);
       const focused = document.activeElement;
       main.stop.hidden = !live || Boolean(sweep.job?.stop_requested);
-      main.resume.hidden = live || sweep.state === "completed";
+      main.resume.hidden = live || isDone(sweep);
       // Who has just pressed what is gone now goes on beside it.
       if (focused?.hidden && node.contains(focused)) [main.resume, main.stop, more].find((other) => !other.hidden).focus();
       const failed = sweep.counts.failed ?? 0;

@@ -5,7 +5,7 @@ import { FrontChart } from "./front_chart.js";
 import { count, NONE, rangeText, returnText, valueText } from "./format.js";
 
 const TOO_FEW = "Said once trials of two settings have ended.";
-const DRAWN = "Each dot is a setting, by its expected mean over seeds; none lies above the line.";
+const DRAWN = "Each dot is a setting, by its expected mean over seeds; none that was scored lies above the line.";
 
 export class FrontCard {
   // `onOpen(trialId)` is called for a setting that the reader wants to see more of.

@@ -9,6 +9,12 @@ export const isLive = (sweep) =>
   sweep.state === "running" || sweep.job?.state === "running" || Boolean(sweep.waiting) || isDriven(sweep);
 export const isWaiting = (sweep) => !isLive(sweep) && ["waiting", "creating"].includes(sweep.job?.state);
 
+// Who has resumed it from a terminal has made of it what its last job did not.
+const isResumedSince = (sweep) => sweep.state === "completed" && sweep.ended_at > sweep.job?.ended_at;
+// Whether all that comes after the trials was made, too: the policy was chosen, and where that can be, filmed.
+export const isDone = (sweep) =>
+  stateWord(sweep) === "completed" && (isResumedSince(sweep) || !sweep.job?.finish_failed);
+
 export function stateOf(sweep) {
   const word = stateWord(sweep);
   return { word, tone: TONES[word] ?? "quiet", group: groupOf(word) };
@@ -18,7 +24,7 @@ function stateWord(sweep) {
   const job = sweep.job;
   if (isLive(sweep)) return job?.stop_requested ? "stopping" : sweep.waiting ? "waiting" : "running";
   if (isWaiting(sweep)) return "waiting";
-  if (job?.outcome === "failed") return "failed";
+  if (job?.outcome === "failed" && !isResumedSince(sweep)) return "failed";
   if (sweep.state === "completed") return "completed";
   if (job?.outcome === "stopped" || job?.outcome === "cancelled") return "stopped";
   return sweep.state;
@@ -33,6 +39,8 @@ function groupOf(word) {
 export function stateReason(sweep) {
   const { word } = stateOf(sweep);
   if (word === "failed") return sweep.job?.message || "Its driver failed; the service's log has more.";
+  // Which trials failed, why no policy was chosen, or what could not be made of it.
+  if (word === "completed") return (!isResumedSince(sweep) && sweep.job?.message) || "";
   if (word === "stopping") return "Its trials save first.";
   if (sweep.waiting) return waitText(sweep.waiting);
   if (word === "waiting")
