@@ -2,7 +2,8 @@
 
 A setting's *cost* is the mean of the env steps that a training with it takes, over its seeds (`SettingScores.cost`). It
 is *on the front* if no other setting is as cheap and better, or as good and cheaper; scores are the expected means by
-which settings are ranked.
+which settings are ranked. A setting of which no seed was scored is not on it: its score is the worst of the others, and
+a short one that only crashed would be the cheapest way to have that.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _LEAST_RATIO = 30.0
 
 
 def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> FrontRecord | None:
-    """Return the front over the settings of a sweep; None: there are none, or their scores are not finite.
+    """Return the front over the settings of a sweep; None: none was scored, or their scores are not finite.
 
     *Near the best* is a setting that loses at most `NEAR` of what the best one gains on the untrained policy, by
     expected means; the cheapest of them is always on the front. Where training gained nothing, or what an untrained
@@ -42,11 +43,12 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
         ranking: The settings, best first.
         untrained: What an untrained policy scores, see `untrained_return`; None: it is not known.
     """
-    if not ranking or not all(math.isfinite(item.expected) for item in ranking):
-        return None
     order = _by_cost(ranking)
+    if not order or not all(math.isfinite(item.expected) for item in ranking):
+        return None
     on_front = _non_dominated(ranking, order)
-    best = ranking[0].expected
+    leader = ranking[min(order)]
+    best = leader.expected
     gained = 0.0 if untrained is None else max(0.0, best - untrained)
     near_score = best - NEAR * gained
     cheapest = next(index for index in order if ranking[index].expected >= near_score)
@@ -66,7 +68,7 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
         undecided=tuple(map(told, undecided[:_NUM_UNDECIDED])),
         num_undecided=None if may_be is None else len(undecided),
         cheapest_near=told(cheapest),
-        best_env_steps=ranking[0].cost,
+        best_env_steps=leader.cost,
         near_share=NEAR,
         untrained=untrained,
         near_score=near_score,
@@ -123,8 +125,9 @@ def points_on_front(ranking: Sequence[SettingScores]) -> set[int]:
 
 
 def _by_cost(ranking: Sequence[SettingScores]) -> list[int]:
-    """Return the indices of settings, the cheapest first; of equal ones, the best."""
-    return sorted(range(len(ranking)), key=lambda index: (ranking[index].cost, index))
+    """Return the indices of settings of which a seed was scored, the cheapest first; of equal ones, the best."""
+    scored = (index for index, item in enumerate(ranking) if item.num_unscored < len(item.scores))
+    return sorted(scored, key=lambda index: (ranking[index].cost, index))
 
 
 def _non_dominated(ranking: Sequence[SettingScores], order: Sequence[int]) -> list[int]:

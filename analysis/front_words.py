@@ -12,7 +12,7 @@ NEAREST = "yes, the cheapest near the best"
 _ABOUT = (
     "On the front are the settings than which no other is as cheap and better, or as good and cheaper, by expected "
     "means over seeds. The cost is the mean env steps of a training: less than its length where it reached its goal, "
-    "and the whole length where a scheduler ended it or it failed."
+    "and the whole length where a scheduler ended it or it failed. A setting of which no seed was scored is not on it."
 )
 
 

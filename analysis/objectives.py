@@ -43,6 +43,8 @@ class SettingScores:
     """What its mean over many seeds is expected to be, see `expected_means`; settings are ranked by this."""
     env_steps: tuple[int, ...]
     """What a training takes, one a seed, in the order of the scores; see `env_steps_of`."""
+    num_unscored: int = 0
+    """Seeds whose score is not their own: they failed, or ended without anything to be scored."""
 
     @property
     def mean(self) -> float:
@@ -106,14 +108,14 @@ def rank_settings(
             num_failed=sum(seed.status == "failed" for seed in seeds),
             expected=value,
             env_steps=tuple(env_steps_of(seed, num_env_steps) for seed in seeds),
+            num_unscored=sum(seed.trial_id not in known for seed in seeds),
         )
         for (index, seeds), value in zip(members.items(), expected, strict=True)
     ]
 
     def order(item: SettingScores) -> tuple[float, float, int, int]:
         # Where the worst score is the best too, who has it for a failure comes behind who has earned it.
-        num_unscored = sum(trial_id not in known for trial_id in item.trial_ids)
-        return -item.expected, -item.mean, num_unscored, item.point_index
+        return -item.expected, -item.mean, item.num_unscored, item.point_index
 
     return sorted(settings, key=order)
 
@@ -128,7 +130,7 @@ def env_steps_of(trial: TrialRecord, num_env_steps: int) -> int:
 
     One that ended by itself took what it takes, less where it reached its goal early. One that a scheduler ended, or
     that failed, counts with the length that it was to have: its score is that of the whole length too, and to fail is
-    not cheap.
+    not cheap. That length may be a short one of its point, see `analysis.front` for settings that only failed.
 
     Args:
         trial: A trial that has ended.

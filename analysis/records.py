@@ -247,6 +247,10 @@ class PriorRecord(Record):
     env_id: str = Field(description="The environment that it trained in.")
     points: tuple[PriorPointRecord, ...] = Field(description="Its points that the later sweep could have.")
     num_ended: int | None = Field(None, description="How many of its points had ended; None: a former record.")
+    by_best_evaluation: bool = Field(
+        default=False,
+        description="Whether they are ranked by their best evaluations, as scores by its objective are not known.",
+    )
 
 
 class JobRecord(Record):
@@ -279,6 +283,9 @@ class SweepRecord(Record):
     replications: tuple[ReplicationRecord, ...] = Field((), description="More seeds of some points, oldest first.")
     chosen_points: tuple[ChosenPointRecord, ...] = Field((), description="Points that somebody chose, oldest first.")
     prior: tuple[PriorRecord, ...] = Field((), description="What its search began with, of earlier sweeps.")
+    repeats: str | None = Field(
+        None, description="The trial that it repeats, SWEEP/TRIAL, and has alone; None: it is no repetition."
+    )
     env_threshold: float | None = Field(None, description="The env's own threshold when it was planned, if it has one.")
     is_flattened: bool = Field(
         default=False,

@@ -7,6 +7,7 @@ from typing import Any
 
 from analysis.best_records import BestRecord
 from analysis.records import SweepRecord, finite_or_none
+from analysis.wording import duration
 from policies.portable.file import BASELINE_KINDS
 
 _ATARI_FRAMES = ("frame_skip", "noop_max")
@@ -62,6 +63,14 @@ def about_of(sweep: SweepRecord) -> dict[str, str]:
     """Look up what the sweep file says of the sweep, for the head of the page: title, description, expected."""
     told = sweep.section("about")
     return {name: str(told.get(name) or "") for name in ("title", "description", "expected")}
+
+
+def run_time_of(sweep: SweepRecord) -> str:
+    """Say how long a sweep ran; empty: not known, as the time is recorded when a run ends, and none has."""
+    if sweep.run_time_s == 0:
+        return ""
+    told = duration(sweep.run_time_s)
+    return f"{told} before this run" if sweep.state == "running" else told
 
 
 def is_trained(sweep: SweepRecord) -> bool:

@@ -14,7 +14,7 @@ from analysis.best_records import BestRecord
 from analysis.points import EMPTY, lacks
 from analysis.records import IterationRecord, TrialRecord
 from analysis.selection import rank_points
-from analysis.tables import groups_frame, point_names, steps_to_solve_frame, trials_frame
+from analysis.tables import groups_frame, point_names, shown_point, steps_to_solve_frame, trials_frame
 from analysis.wording import NONE, is_number, number, return_text
 
 MAX_STEPS_ROWS = 20
@@ -86,7 +86,7 @@ def trial_table(
         columns["num_env_steps_to_solve"] = "env steps to solve"
     columns |= {"num_env_steps": "env steps", "core_seconds": "core-seconds", "seed": "seed"}
     columns |= {"stop_reason": "ended by"}
-    lacking = {trial.trial_id: [name for name in names if lacks(trial.point, name)] for trial in trials}
+    lacking = {trial.trial_id: [name for name in names if lacks(shown_point(trial), name)] for trial in trials}
     rows = []
     for row in sorted(frame.to_dict("records"), key=lambda row: order.get(row["trial_id"], len(order))):
         empty = lacking[row["trial_id"]]

@@ -6,7 +6,8 @@ units. A value that is not known is missing (NaN, an empty CSV cell), never 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,8 +72,22 @@ def _values_of(change: ChangeRecord) -> str:
 
 
 def point_names(trials: Sequence[TrialRecord]) -> list[str]:
-    """Return the names of the searched hyperparameters, in the order of the sweep file."""
-    return searched_names(trial.point for trial in trials)
+    """Return the names of the searched hyperparameters, in the order of the sweep file.
+
+    In a population also of those that act in no trial any more.
+    """
+    return searched_names(point for trial in trials for point in points_of(trial))
+
+
+def points_of(trial: TrialRecord) -> list[dict[str, Any]]:
+    """Return all points that a trial has had; they are several only in a population."""
+    return [*(point for change in trial.changes for point in (change.before, change.after)), trial.point]
+
+
+def shown_point(trial: TrialRecord) -> dict[str, Any]:
+    """Return the searched values that a trial's score was reached with, to stand beside it; its newest without one."""
+    best = score_trial(trial) if trial.changes else None
+    return trial.point if best is None else trial.point_at(best.checkpoint.iteration)
 
 
 def types_with_gaps(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, str]:
@@ -96,6 +111,8 @@ def env_steps_to(
     threshold: float | None,
     iterations: Sequence[IterationRecord],
     num_episodes: int = SOLVED_OVER_NUM_EPISODES,
+    *,
+    changed_at: Collection[int] = (),
 ) -> int | None:
     """Return the env steps until the training return first reached a threshold; None if it never did.
 
@@ -103,14 +120,29 @@ def env_steps_to(
         threshold: Mean episode return to reach; None: there is nothing to reach.
         iterations: The iterations of one trial, oldest first.
         num_episodes: How many whole episodes the mean must be over.
+        changed_at: The iterations after which a trial of a population went on from another's copy: the mean is of the
+            episodes since then.
     """
     if threshold is None:
         return None
+    to_come = deque(sorted(changed_at))
+    num_since: int | None = None
     for item in iterations:
-        value = item.training_return
-        if item.num_episodes >= num_episodes and value is not None and value >= threshold:
+        while to_come and to_come[0] < item.iteration:
+            to_come.popleft()
+            num_since = 0
+        if num_since is not None:
+            num_since += len(item.episode_returns)
+        value, num_played = item.training_return, item.num_episodes if num_since is None else num_since
+        if num_played >= num_episodes and value is not None and value >= threshold:
             return item.num_env_steps
     return None
+
+
+def _env_steps_to_solve(
+    trial: TrialRecord, threshold: float | None, iterations: Sequence[IterationRecord]
+) -> int | None:
+    return env_steps_to(threshold, iterations, changed_at=[change.iteration for change in trial.changes])
 
 
 def env_steps_to_evaluation(threshold: float | None, iterations: Sequence[IterationRecord]) -> int | None:
@@ -158,7 +190,7 @@ def trials_frame(
     rows = []
     for trial in sorted(trials, key=lambda item: item.index):
         best = score_trial(trial)
-        point = trial.point if best is None else trial.point_at(best.checkpoint.iteration)
+        point = shown_point(trial)
         rows.append(
             {
                 "trial_id": trial.trial_id,
@@ -172,7 +204,7 @@ def trials_frame(
                 "training_return": trial.training_return,
                 "evaluation_return": trial.evaluation_return,
                 "collapsed": collapsed[trial.trial_id],
-                "num_env_steps_to_solve": env_steps_to(threshold, rows_of(trial)),
+                "num_env_steps_to_solve": _env_steps_to_solve(trial, threshold, rows_of(trial)),
                 "num_env_steps_to_threshold": env_steps_to_evaluation(threshold, rows_of(trial)),
                 "num_iterations": trial.num_iterations,
                 "num_env_steps": trial.num_env_steps,
@@ -276,7 +308,10 @@ def steps_to_solve_frame(
         points.setdefault(trial.point_index, []).append(trial)
     rows = []
     for index, members in sorted(points.items()):
-        steps = {trial.seed_index: env_steps_to(threshold, results.get(trial.trial_id, ())) for trial in members}
+        steps = {
+            trial.seed_index: _env_steps_to_solve(trial, threshold, results.get(trial.trial_id, ()))
+            for trial in members
+        }
         # A seed that still runs may yet solve it.
         known = [steps[t.seed_index] for t in members if t.status in FINISHED or steps[t.seed_index] is not None]
         solved = [value for value in known if value is not None]

@@ -40,7 +40,7 @@ def make_charts(subject: Subject) -> list[Chart]:
     )
     plot = Plot(x, Axis(subject.score_name), tuple(line for line in lines if line.x), goal=_goal(subject))
     title = "Score against cost, and the front"
-    caption = "Each dot is a setting, by its expected mean over seeds; no setting lies above the line."
+    caption = "Each dot is a setting, by its expected mean over seeds; no setting that was scored lies above the line."
     return [Chart("score_against_cost", "front", title, caption, Plots((plot,)), notes=tuple(notes))]
 
 

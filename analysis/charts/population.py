@@ -9,8 +9,9 @@ from analysis.charts.learning import ENV_STEPS
 from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots
 from analysis.charts.subject import Subject
 from analysis.plot_style import PALETTE
-from analysis.points import value_of
+from analysis.points import value_of, value_text
 from analysis.records import TrialRecord
+from analysis.tables import point_names, points_of
 
 _MAX_PALE = 80
 _NUM_TOP = 3
@@ -22,10 +23,11 @@ def make_charts(subject: Subject) -> list[Chart]:
         return []
     title = "The population's schedules"
     caption = "The value that each trial had over its env steps; it jumps where it went on from a better one's copy."
-    changed = {name for trial in subject.trials for change in trial.changes for name in change.after}
-    changing = [name for name in subject.varied_names if name in changed]
+    changing = _names(subject)
     if not changing:
         why = "No trial has gone on from another's copy yet, so every value is as it was at the start."
+        if any(trial.changes for trial in subject.trials):
+            why = "All trials have had the same values, and no copy has changed one."
         return [Chart("schedules", "learning", title, caption, None, why)]
     top = [trial_id for setting in subject.settings[:_NUM_TOP] for trial_id in setting.trial_ids]
     others = [trial for trial in subject.begun if trial.trial_id not in top]
@@ -33,6 +35,18 @@ def make_charts(subject: Subject) -> list[Chart]:
     drawn = [trial for trial in subject.begun if trial.trial_id in top] + others[:_MAX_PALE]
     plots = tuple(_plot(subject, name, drawn, top) for name in changing)
     return [Chart("schedules", "learning", title, caption, Plots(plots), notes=notes)]
+
+
+def _names(subject: Subject) -> list[str]:
+    """Return the names of which trials have had several values, the most important first; none before any copy.
+
+    Those that all trials end with alike were searched, too.
+    """
+    if not any(trial.changes for trial in subject.trials):
+        return []
+    points = [point for trial in subject.begun for point in points_of(trial)]
+    names = dict.fromkeys([*subject.varied_names, *point_names(subject.begun)])
+    return [name for name in names if len({value_text(point, name) for point in points}) > 1]
 
 
 def _plot(subject: Subject, name: str, trials: Sequence[TrialRecord], top: Sequence[str]) -> Plot:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from analysis.comparison.entries import Entry, Wanted, judged_alike, make_entry
 from analysis.comparison.pairs import Pair, make_pair
+from analysis.comparison.repetition import same_numbers
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
 from analysis.report_data import env_arguments_of, env_of
 from analysis.wording import counted
@@ -151,14 +152,27 @@ def _same_trainings(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[
         same_sweep = entries[one].sweep == entries[other].sweep
         if same_sweep or why_not_comparable([item.sweep for item in pair], [item.name for item in pair]):
             continue
-        ours, theirs = ({_training(trial) for trial in _counted(item)} for item in pair)
-        if same := len(ours & theirs):
+        if same := _num_same(*pair):
             notes.append(
                 f"{entries[one].letter} and {entries[other].letter} have {counted(same, 'training')} with the same "
-                "hyperparameters and the same training seed: on one machine these are the same numbers twice, and the "
-                "intervals take them for independent ones."
+                "hyperparameters, the same training seed and the same results: these are the same numbers twice, and "
+                "the intervals take them for independent ones."
             )
     return notes
+
+
+def _num_same(one: Wanted, other: Wanted) -> int:
+    """Return how many trainings two sweeps both did: those of one seed may still see or build something else."""
+    theirs = {_training(trial): trial.trial_id for trial in _counted(other)}
+    are_evaluated_alike = one.sweep.evaluation_seeds == other.sweep.evaluation_seeds
+    alike = ((trial.trial_id, theirs.get(_training(trial))) for trial in _counted(one))
+    return sum(
+        same_numbers(
+            one.data.results.get(ours, ()), other.data.results.get(twin, ()), are_evaluated_alike=are_evaluated_alike
+        )
+        for ours, twin in alike
+        if twin is not None
+    )
 
 
 def _counted(item: Wanted) -> list[TrialRecord]:

@@ -73,11 +73,13 @@ class Entry:
     num_env_steps: int
     core_seconds: float | None
     wall_s: float | None
-    """Seconds that the sweep ran; None of a setting."""
+    """Seconds that the sweep ran, in runs that have ended; None of a setting, or where none has."""
     why_none: str = ""
     """Why there are no scores; empty if there are."""
     sweep_df: float | None = None
     """Degrees of freedom that the seeds of all settings of the sweep have together; None: as `df`."""
+    is_running: bool = False
+    """Whether the sweep runs, so that `wall_s` is of what was before this run."""
 
 
 def judged_alike(wanted: Wanted, objective: Objective, threshold: float | None) -> Wanted:
@@ -127,7 +129,9 @@ def make_entry(wanted: Wanted, letter: str, *, shares_threshold: bool = True) ->
         num_trials=len(mine),
         num_env_steps=sum(trial.num_env_steps for trial in mine),
         core_seconds=math.fsum(known) if known else None,
-        wall_s=wanted.sweep.run_time_s if wanted.point_index is None else None,
+        # It is written when a run ends.
+        wall_s=(wanted.sweep.run_time_s or None) if wanted.point_index is None else None,
+        is_running=wanted.sweep.state == "running",
         why_none="" if chosen is not None else why_no_scores(wanted, shares_threshold=shares_threshold),
     )
     if chosen is None:

@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from analysis.comparison.entries import Entry, Wanted
 from analysis.exports.frames import ranked_settings
-from analysis.objectives import SettingScores
 from analysis.points import meaning_of
+from analysis.records import SweepRecord
 from analysis.statistics import Estimate, iqm, iqm_with_ci, probability_of_improvement, t_quantile
-from analysis.wording import counted
+from analysis.wording import counted, setting_text
 from policies import random_streams
+from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
+
+_MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
 class Shared:
-    """The settings that two sweeps have in common, each a stratum; points of a sweep with equal values are one."""
+    """The settings that two sweeps have in common, each a stratum; points of a sweep with equal values are one.
+
+    A setting is all that a training has of hyperparameters, fixed ones and defaults too.
+    """
 
     num_settings: int
     probability: Estimate
@@ -152,15 +159,17 @@ def mean_difference(
 
 def _shared(left: Wanted, right: Wanted, level: float) -> tuple[Shared | None, str]:
     """Compare two sweeps within the settings that both have trained, or say why that can't be done."""
-    ours, theirs = (_by_meaning(ranked_settings(each.data)) for each in (left, right))
-    common = [key for key in ours if key in theirs]
+    ours, theirs = map(_by_meaning, (left, right))
     if not ours or not theirs:
         return None, ""
+    why = _why_other_trainings(left, right)
+    common = [] if why else [key for key in ours if key in theirs]
     if not common:
-        return None, (
+        why = why or (
             f"none of the {counted(len(ours), 'setting')} of {left.name} is among the "
-            f"{counted(len(theirs), 'setting')} of {right.name}, so only the leading ones are compared"
+            f"{counted(len(theirs), 'setting')} of {right.name}"
         )
+        return None, f"{why}, so only the leading ones are compared"
     left_scores, right_scores = [ours[key] for key in common], [theirs[key] for key in common]
     return Shared(
         num_settings=len(common),
@@ -177,9 +186,44 @@ def _iqm(tasks: list[tuple[float, ...]], level: float) -> Estimate:
     return Estimate(iqm(scores), math.nan, math.nan, len(scores), "one seed a setting: no interval")
 
 
-def _by_meaning(settings: Sequence[SettingScores]) -> dict[str, tuple[float, ...]]:
-    """Return the scores of all seeds of each setting; several points may have equal values, or write them otherwise."""
+def _why_other_trainings(left: Wanted, right: Wanted) -> str:
+    """Return why no setting of one sweep can be one of the other's, whatever they search; empty if some may be."""
+    ours, theirs = left.sweep, right.sweep
+    for name, plain in (("algorithm", ""), ("rl_module", "the built-in network")):
+        values = [str(sweep.spec.get(name) or plain) for sweep in (ours, theirs)]
+        if values[0] != values[1]:
+            return f"{left.name} trains with {values[0]} and {right.name} with {values[1]}"
+    searched = {*ours.section("space"), *theirs.section("space")}
+    one, other = _unsearched(ours), _unsearched(theirs)
+    names = [
+        name
+        for name in sorted({*one, *other} - searched)
+        if meaning_of({name: one.get(name)}) != meaning_of({name: other.get(name)})
+    ]
+    told = [
+        f"{name} is {setting_text(one.get(name))} in {left.name} and {setting_text(other.get(name))} in {right.name}"
+        for name in names[:_MOST_NAMED]
+    ]
+    if more := len(names) - len(told):
+        told.append(f"and {more:,} more {'differs' if more == 1 else 'differ'}")
+    return ", ".join(told)
+
+
+def _unsearched(sweep: SweepRecord) -> dict[str, Any]:
+    """Return the hyperparameters that a sweep gives all of its trainings: the defaults, and what its file has."""
+    known = HYPERPARAMS_BY_ALGORITHM.get(str(sweep.spec.get("algorithm")))
+    fields = {} if known is None else known.model_fields
+    defaults = {name: field.get_default(call_default_factory=True) for name, field in fields.items()}
+    return {**defaults, **sweep.section("hyperparams")}
+
+
+def _by_meaning(wanted: Wanted) -> dict[str, tuple[float, ...]]:
+    """Return the scores of all seeds of each setting; several points may have equal values, or write them otherwise.
+
+    A value that one sweep searches and another has fixed, or by default, is the same value.
+    """
+    unsearched = _unsearched(wanted.sweep)
     scores: defaultdict[str, tuple[float, ...]] = defaultdict(tuple)
-    for item in settings:
-        scores[meaning_of(item.point)] += item.scores
+    for item in ranked_settings(wanted.data):
+        scores[meaning_of({**unsearched, **item.point})] += item.scores
     return dict(scores)

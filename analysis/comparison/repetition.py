@@ -118,6 +118,32 @@ def first_difference(
     return None
 
 
+def same_numbers(
+    one: Sequence[IterationRecord], other: Sequence[IterationRecord], *, are_evaluated_alike: bool
+) -> bool:
+    """Whether two trainings have the same numbers in all iterations that both have; False if that is none.
+
+    Args:
+        one: Iterations, oldest first.
+        other: Those of the other.
+        are_evaluated_alike: Whether both are evaluated on the same seeds; where not, evaluations say nothing.
+    """
+    by_number = {item.iteration: item for item in other}
+    both = [(item, by_number[item.iteration]) for item in one if item.iteration in by_number]
+    return bool(both) and all(_are_same(*pair, are_evaluated_alike=are_evaluated_alike) for pair in both)
+
+
+def _are_same(one: IterationRecord, other: IterationRecord, *, are_evaluated_alike: bool) -> bool:
+    names = [name for name in _COMPARED if name != "evaluation_return"]
+    # One of them may be evaluated less often.
+    if are_evaluated_alike and None not in (one.evaluation_return, other.evaluation_return):
+        names.append("evaluation_return")
+    learned = ((one.learner.get(name), other.learner.get(name)) for name in {*one.learner, *other.learner})
+    return all(_same(getattr(one, name), getattr(other, name)) for name in names) and all(
+        _same(*values) for values in learned
+    )
+
+
 def causes(recorded: Mapping[str, str], now: Mapping[str, str]) -> tuple[Changed, ...]:
     """Return what a training ran with that is other now.
 

@@ -36,7 +36,7 @@ def fact_rows(comparison: Comparison) -> list[tuple[str, list[str]]]:
         (f"steps to {threshold:g}" if threshold is not None else "steps", _median),
         ("env steps spent", _spent),
         ("core time", lambda entry: PLAIN_NONE if entry.core_seconds is None else duration(entry.core_seconds)),
-        ("wall time", lambda entry: PLAIN_NONE if entry.wall_s is None else duration(entry.wall_s, none=PLAIN_NONE)),
+        ("wall time", _wall),
         ("no scores", lambda entry: entry.why_none or PLAIN_NONE),
     ]
     rows = [(title, [read(entry) for entry in entries]) for title, read in readers]
@@ -138,6 +138,13 @@ def _median(entry: Entry) -> str:
         return text
     low = "0" if entry.median_lower is None else f"{entry.median_lower:,.0f}"
     return f"{text} ({low} to {f'{entry.median_upper:,.0f}' if entry.median_upper is not None else 'never'})"
+
+
+def _wall(entry: Entry) -> str:
+    if entry.wall_s is None:
+        return PLAIN_NONE
+    told = duration(entry.wall_s, none=PLAIN_NONE)
+    return f"{told} before this run" if entry.is_running else told
 
 
 def _spent(entry: Entry) -> str:

@@ -10,6 +10,7 @@ from analysis.core_seconds import busy_cores, busy_seconds
 from analysis.objectives import reached_goal
 from analysis.page.source import Source
 from analysis.records import TrialRecord, length_of
+from analysis.report_data import run_time_of
 from analysis.wording import counted, duration, number
 
 _ESTIMATED = (
@@ -56,6 +57,9 @@ def _wall_time(source: Source) -> list[tuple[str, str]]:
     busy, total = busy_seconds(source.trials), source.sweep.run_time_s
     if not total > 0:
         return []
+    if source.sweep.state == "running":
+        # Its trials trained in this run too.
+        return [("wall time", run_time_of(source.sweep))]
     text, cores = duration(total), busy_cores(source.trials, source.core_seconds)
     if cores:
         # Of all attempts, of which the records say when the latest ones were.

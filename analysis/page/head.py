@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from analysis import report_data
 from analysis.page.source import Source
 from analysis.tables import trials_frame
-from analysis.wording import duration, number
+from analysis.wording import number
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,9 @@ def _facts(source: Source) -> list[tuple[str, str]]:
     facts = [
         ("trials", ", ".join(f"{count:,} {status}" for status, count in statuses.most_common()) or "none"),
         ("env steps", number(sum(trial.num_env_steps for trial in trials))),
-        ("wall time", duration(source.sweep.run_time_s)),
     ]
+    if ran := report_data.run_time_of(source.sweep):
+        facts.append(("wall time", ran))
     if goal is not None:
         solved = frame["num_env_steps_to_solve"].dropna()
         facts.append(("solved in training", f"{len(solved):,} of {len(trials):,}"))

@@ -186,6 +186,10 @@ def _hyperparams(source: Source, best: SettingRecord) -> TrainedHyperparams | No
 def _trained(spec: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a sweep file says of the training: without what is empty, and without how it was searched and run."""
     content = {name: _filled(value) for name, value in spec.items() if name not in _OF_THE_RUN}
+    env = spec.get("env")
+    if isinstance(env, Mapping) and env.get("args"):
+        # What is null or empty there is the environment's own to read.
+        content["env"]["args"] = env["args"]
     return {name: value for name, value in content.items() if value not in (None, {})}
 
 

@@ -10,9 +10,10 @@ from typing import Any
 from analysis.domains import arguments_of, conditions_of, kind_of
 from analysis.page.source import Source
 from analysis.records import SweepRecord
+from analysis.report_data import run_time_of
 from analysis.report_tables import Cell, Table
 from analysis.tables import cell_value
-from analysis.wording import NONE, duration, moment, number, seed_range, shown_part
+from analysis.wording import NONE, moment, number, seed_range, shown_part
 
 _MAX_CPUS = 4
 
@@ -46,10 +47,11 @@ def section(source: Source) -> Repeat:
 
 def facts(sweep: SweepRecord) -> list[tuple[str, str]]:
     """Return when, with what and on which seeds the sweep ran."""
+    ran = run_time_of(sweep)
     rows = [
         ("started", moment(sweep.started_at)),
         ("ended", moment(sweep.ended_at)),
-        ("time in all", duration(sweep.run_time_s)),
+        *([("time in all", ran)] if ran else []),
         ("sweep seed", str(sweep.spec.get("seed", NONE))),
         ("training seeds", "of each trial, in the table above: they follow from the sweep seed"),
         ("evaluation seeds", seed_range(sweep.evaluation_seeds)),

@@ -18,7 +18,7 @@ import numpy as np
 from policy_factory import make_portable
 from scripted_packs import STEPS, make_sweep
 
-from analysis.records import ChangeRecord, TrialRecord
+from analysis.records import FINISHED, ChangeRecord, TrialRecord
 from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import NetworkPolicy, Policy
 from policies.portable.file import PortablePolicy
@@ -29,6 +29,7 @@ from tune_jobs.ray_tune.pack_trainable import PackTrainable
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import Scheduler
 from tune_jobs.ray_tune.trainable import TaskReader
+from tune_jobs.search.comparisons import comparisons_before
 from tune_jobs.search.gains import Evaluations
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.copies import remove_uncounted_copies
@@ -73,6 +74,7 @@ class Engine:
         """Trial, iteration and learning rate, in the order in which they were trained."""
         self.begun: list[tuple[str, str]] = []
         """Trials that were opened, and the weights that they began with."""
+        self.moved: Collection[str] = ()
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
         assert task.trial_id not in self.tasks
@@ -176,7 +178,7 @@ class Packs:
 
     def begin(self) -> None:
         """Drive it: from its beginning, or from what is on disk."""
-        todo = [record.trial_id for record in self.store.read_trials() if record.status not in ("completed", "failed")]
+        self.todo = todo = [record.trial_id for record in self.store.read_trials() if record.status not in FINISHED]
         for name in todo:
             remove_uncounted_copies(self.store.trial(name), self.store.trial(name).read_record().changes)
         self.keeper = RecordKeeper(self.store, todo, lambda record: None)
@@ -191,14 +193,17 @@ class Packs:
         if self.spec.scheduler.type == "hyperband":
             grace = self.spec.scheduler.grace_env_steps or 1
             return HyperBand(grace, self.spec.stop.num_env_steps, self.spec.scheduler.reduction_factor)
-        return Population(self.spec, self.keeper.record, self._curves(), self.keeper.all_records)
+        todo = [self.keeper.record(name) for name in self.todo]
+        before = comparisons_before(self.store, self.spec, todo)
+        return Population(self.spec, self.keeper.record, self._curves(), self.keeper.all_records, before=before)
 
     def _curves(self) -> Evaluations | None:
         return Evaluations(self.store) if self.spec.scheduler.type == "pb2" else None
 
     def population(self) -> Population:
         """Its rule, to which all trials are known and that has compared none."""
-        population = Population(self.spec, self.keeper.record, self._curves())
+        before = comparisons_before(self.store, self.spec, self.keeper.all_records())
+        population = Population(self.spec, self.keeper.record, self._curves(), before=before)
         for record in self.keeper.all_records():
             population.begins(record.trial_id)
         return population
@@ -234,6 +239,10 @@ class Packs:
 
     def records(self) -> list[TrialRecord]:
         return self.keeper.all_records()
+
+    def has_reached(self, num_env_steps: int) -> bool:
+        """Whether any trial has."""
+        return any(record.num_env_steps >= num_env_steps for record in self.records())
 
     def changes(self) -> dict[str, list[ChangeRecord]]:
         """What was changed, without the times at which it was."""

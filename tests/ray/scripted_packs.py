@@ -78,6 +78,7 @@ def scripted_trainable(scripts: dict[str, dict[str, Any]], pause_s: float) -> ty
         def __init__(self) -> None:
             self.tasks: dict[str, TrialTask] = {}
             self.iterations: dict[str, int] = {}
+            self.moved: Collection[str] = ()
 
         def add(self, task: TrialTask, checkpoint: Path | None) -> None:
             assert task.trial_id not in self.tasks

@@ -1,15 +1,22 @@
 """HyperBand decides as Ray Tune's does wherever that comes to an end, and no trial waits for ever."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 from former_schedulers import former_hyperband
 from hyperband_sweeps import Controller, FakedTrial, decided
+from ray import tune
 from ray.tune.experiment import Trial
+from scripted_packs import make_sweep
 
+from analysis.records import TrialRecord
+from tune_jobs.ray_tune import run_trials
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
 from tune_jobs.ray_tune.hyperband import HyperBand, HyperBandScheduler
+from tune_jobs.ray_tune.meetings import compared_with
+from tune_jobs.ray_tune.processes import RayWatch
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
 
 pytestmark = pytest.mark.ray
@@ -123,3 +130,63 @@ def test_a_trial_that_is_tried_again_stays_in_its_bracket_as_in_packs() -> None:
     trials[6].status = Trial.RUNNING
     scheduler.on_trial_error(controller, trials[6])
     assert controller.take_stopped() == ["t0003"]
+
+
+def record(number: int, **given: Any) -> TrialRecord:
+    return TrialRecord(trial_id=f"t{number:04d}", index=number, point_index=number, seed=number, point={}, **given)
+
+
+def test_trials_of_a_resumed_sweep_have_the_places_that_they_had_among_all() -> None:
+    """Of the eight places of a bracket five are of trials that have ended; at a milestone as many go on as would."""
+    records = [
+        record(number, status="stopped" if number < 4 else "failed" if number == 4 else "paused")
+        for number in range(12)
+    ]
+    todo = {one.trial_id for one in records[5:]}
+    scheduler = HyperBandScheduler(rule := made(0))
+    scheduler.begin(records, todo)
+    trials = [FakedTrial(number) for number in range(5, 12)]
+    controller: Any = Controller(trials, scheduler, 100)
+    for trial in trials:
+        scheduler.on_trial_add(controller, trial)
+    assert list(rule.in_turn()) == sorted(todo)
+    assert [rule.next_milestone(one.trial_id) for one in trials] == [100] * 3 + [200] * 4
+    # The three that are left of the first bracket were among the four better ones at 100 env steps.
+    assert [reach(rule, number, 200, number) for number in (5, 6, 7)] == [Decision.WAIT] * 2 + [Decision.GO_ON]
+    assert rule.take_ended() == ["t0005"]
+
+
+def test_who_had_places_beside_trials_of_a_run_are_those_of_their_engine_that_were_compared() -> None:
+    records = [
+        record(0, status="stopped", engine="packed"), record(1, status="stopped", engine="rllib"),
+        record(2, status="paused", engine="packed"), record(3, status="pending", engine="packed"),
+        record(4, status="completed", engine="packed", seed_index=1), record(5, status="failed", engine="packed"),
+    ]  # fmt: skip
+    found = compared_with({"t0002"}, records, seeds_per_point=1)
+    assert [one.trial_id for one in found] == ["t0000", "t0002", "t0005"]
+
+
+def test_a_run_of_single_trials_gives_them_the_places_that_they_had_among_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = dict[str, Any]()
+
+    class Tuner:
+        def __init__(self, *_: Any, tune_config: Any, **__: Any) -> None:
+            given["scheduler"] = tune_config.scheduler
+
+        def fit(self) -> None:
+            pass
+
+    monkeypatch.setattr(tune, "Tuner", Tuner)
+    settings = {"type": "hyperband", "grace_env_steps": 100, "reduction_factor": 2.0}
+    store = make_sweep(tmp_path / "mine", 12, scheduler=settings, stop={"num_env_steps": 800})
+    for one in store.read_trials()[:5]:
+        store.trial(one.trial_id).write_record(one.model_copy(update={"status": "stopped"}))
+    todo = tuple(f"t{number:04d}" for number in range(5, 12))
+    job = run_trials.RunJob(store.place, todo, cpus_per_trial=1, gpus_per_trial=0, max_concurrent=1)
+    run = run_trials._Run(job, store, lambda _: None, store.take(), RayWatch({}, grace_s=1.0))
+    run.all_trials()
+    run.keeper.close()
+    rule = given["scheduler"].scheduler
+    assert [rule.next_milestone(name) for name in todo] == [100] * 3 + [200] * 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,35 @@ def test_hyperband_ends_the_same_trials_at_the_same_env_steps_in_packs(tmp_path:
     assert 2 <= sum(status == "completed" for status, _ in found.values()) <= 7
     # Nobody begins anew: who waited goes on where it was, in whichever pack.
     assert len(packs.trained()) == sum(steps // 100 for _, steps in found.values())
+
+
+@pytest.mark.parametrize(("seed", "every", "slots"), [(0, 1, 9), (1, 2, 64)])
+def test_a_sweep_that_is_resumed_ends_the_trials_that_it_would_have_ended(
+    tmp_path: Path, seed: int, every: int, slots: int
+) -> None:
+    """Trials of two brackets, of which those that have ended by then are not run again."""
+
+    def made(name: str) -> Packs:
+        return Packs(
+            tmp_path / name, 30, random_scores(seed, 1_000), {"type": "hyperband", "grace_env_steps": 100}, seed=seed,
+            slots=slots, stop={"num_env_steps": 2_000}, evaluation={"every_iterations": every, "num_episodes": 1},
+        )  # fmt: skip
+
+    def ends(packs: Packs) -> list[tuple[str, int]]:
+        return [(record.status, record.num_env_steps) for record in packs.records()]
+
+    whole = ends(made("whole").run())
+    assert 1 < sum(status == "completed" for status, _ in whole) < 6
+    num_stopped = []
+    for at in (300, 700, 1_300):
+        packs = made(f"killed at {at}")
+        packs.run(until=functools.partial(packs.has_reached, at))
+        num_stopped.append(sum(status == "stopped" for status, _ in ends(packs)))
+        packs.begin()
+        packs.run()
+        assert ends(packs) == whole, at
+    assert num_stopped == sorted(set(num_stopped))
+    assert num_stopped[0] > 0
 
 
 def test_a_member_that_fails_does_not_hold_up_its_bracket(tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from meeting_packs import Packs, Score, random_scores
@@ -121,6 +123,47 @@ def test_a_sweep_that_is_resumed_is_compared_where_it_would_have_been(
     packs.run()
     assert {record.status for record in packs.records()} == {"completed"}
     assert packs.changes() == whole.changes()
+
+
+@pytest.mark.parametrize(
+    ("every", "interval", "points"),
+    [
+        (100, 240, [(300, 5), (400, 8), (1_200, 5)]),
+        (300, 200, [(200, 8), (600, 5), (1_100, 8)]),
+        (400, 250, [(300, 8), (800, 5), (1_200, 5)]),
+        (500, 200, [(300, 8), (500, 5), (1_400, 8)]),
+    ],
+)
+@pytest.mark.parametrize("stops", [False, True])
+def test_so_it_is_where_intervals_are_no_multiples_of_the_env_steps_between_evaluations(
+    tmp_path: Path, every: int, interval: int, points: list[tuple[int, int]], stops: bool
+) -> None:
+    """Stopped where five of the eight wait for the others, and between the end of an interval and an evaluation."""
+    scheduler = {**MF, "perturb_every_env_steps": interval, "frequencies": [1, 4]}
+
+    def made(name: str, slots: int) -> Packs:
+        packs = Packs(
+            tmp_path / name, 8, random_scores(3, 40), scheduler, num_packs=1, slots=slots,
+            stop={"num_env_steps": 1_600}, evaluation={"every_iterations": every // 100, "num_episodes": 1},
+        )  # fmt: skip
+        # Each step is one iteration.
+        packs.rng = cast("Any", SimpleNamespace(choice=lambda among: among[0]))
+        return packs
+
+    whole = made("whole", 8).run().changes()
+    assert {each.num_env_steps for changes in whole.values() for each in changes} <= set(range(every, 1_600, every))
+    assert all(any(whole[name] for name in names) for names in (FAST, SLOW))
+    for at, slots in points:
+        packs = made(f"stopped at {at}", slots)
+        packs.run(until=functools.partial(packs.has_reached, at))
+        assert (len({one.num_env_steps for one in packs.records()}) > 1) == (slots < 8)
+        if stops:
+            packs.store.request_stop()
+            packs.run()
+            packs.store.clear_stop_request()
+        packs.begin()
+        packs.run()
+        assert packs.changes() == whole, at
 
 
 def test_a_sweep_that_is_resumed_between_two_comparisons_selects_when_it_would_have(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ _ALL = (
     _sweep("pbt", "ppo", scheduler={"type": "pbt", "perturb_every_env_steps": 512, "quantile_fraction": 0.5},
            resources=_ONE_PROCESS),
     _sweep("seeds_per_point", "ppo", engine="packed", env={"id": "Acrobot-v1", "frame_stack": 2}, seeds_per_point=2),
-    _sweep("random", "random", num_samples=1, seeds_per_point=2),
+    _sweep("random_play", "random", num_samples=1, seeds_per_point=2),
     _sweep("stopped_packed", "ppo", engine="packed", stopped_at=2, resources=_ONE_PROCESS, **_LONG_PACKED),
     _sweep("stopped_rllib", "ppo", engine="rllib", stopped_at=2, **_LONG_RLLIB),
 )  # fmt: skip

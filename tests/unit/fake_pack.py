@@ -33,6 +33,7 @@ class FakePackEngine:
         self.members: dict[str, FakeEngine] = {}
         self.builds: list[tuple[str, int | None]] = []
         self.num_iterations, self.closed = 0, False
+        self.moved: Collection[str] = ()
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
         assert task.trial_id not in self.members

@@ -207,6 +207,15 @@ def test_a_running_sweep_is_told_with_how_far_it_is() -> None:
     assert found.entries[0].why_none == "none of its 5 trials has ended yet"
 
 
+def test_the_wall_time_of_a_run_under_way_is_not_said_to_be_none() -> None:
+    ours, theirs = wanted("a", LEFT, state="running", run_time_s=0.0), wanted("b", RIGHT, run_time_s=70.4)
+    found = compare([ours, theirs])
+    assert [entry.wall_s for entry in found.entries] == [None, 70.4]
+    assert dict(fact_rows(found))["wall time"] == ["-", "1 min 10 s"]
+    resumed = dataclasses.replace(ours, sweep=ours.sweep.model_copy(update={"run_time_s": 70.4}))
+    assert dict(fact_rows(compare([resumed, theirs])))["wall time"] == ["1 min 10 s before this run", "1 min 10 s"]
+
+
 def test_the_same_trainings_twice_are_told() -> None:
     left, right = wanted("a", LEFT), wanted("b", LEFT)
     assert not any("numbers twice" in note for note in compare([left, right]).notes)

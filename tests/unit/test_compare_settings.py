@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -195,3 +196,120 @@ def test_what_changes_the_returns_of_a_game_is_an_argument(tmp_path: Path, other
     assert differs in reasons[0]
     with pytest.raises(SpecError, match="with other arguments: their returns have no common axis"):
         tune_jobs.figure(["a", "b"], storage=tmp_path)
+
+
+def with_spec(wanted_one: Wanted, **spec: Any) -> Wanted:
+    changed = {**wanted_one.sweep.spec, **spec}
+    return dataclasses.replace(wanted_one, sweep=wanted_one.sweep.model_copy(update={"spec": changed}))
+
+
+def without_points(wanted_one: Wanted) -> Wanted:
+    """The sweep as one that searches nothing."""
+    trials = [trial.model_copy(update={"point": {}}) for trial in wanted_one.data.trials]
+    return dataclasses.replace(wanted_one, data=dataclasses.replace(wanted_one.data, trials=trials))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "why"),
+    [
+        ({"algorithm": "ppo"}, {"algorithm": "dqn"}, "a trains with ppo and b with dqn"),
+        (
+            {"rl_module": None}, {"rl_module": "mine:Net"},
+            "a trains with the built-in network and b with mine:Net",
+        ),
+        ({"hyperparams": {"gamma": 0.9}}, {"hyperparams": {"gamma": 0.8}}, "gamma is 0.9 in a and 0.8 in b"),
+        ({"hyperparams": {"gamma": 0.9}}, {"hyperparams": {}}, "gamma is 0.9 in a and 0.99 in b"),
+        (
+            {"hyperparams": {"gamma": 0.9, "gae_lambda": 0.9, "num_epochs": 1, "clip_param": 0.1}}, {"hyperparams": {}},
+            "gamma is 0.9 in a and 0.99 in b, and 1 more differs",
+        ),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("searches", [True, False])
+def test_other_algorithms_networks_or_fixed_values_are_no_common_setting(
+    one: dict[str, Any], other: dict[str, Any], why: str, searches: bool
+) -> None:
+    # What both search is lr, with one value; or they search nothing.
+    left, right = (
+        with_spec(wanted(name, scores), space={"lr": {"grid": [0.1]}} if searches else {}, **spec)
+        for name, scores, spec in (("a", LEFT, one), ("b", RIGHT, other))
+    )
+    found = compare([left, right] if searches else [without_points(left), without_points(right)])
+    pair = the_pair(found)
+    assert pair.shared is None
+    assert f"{why}, so only the leading ones are compared." in said(found)
+    assert pair.probability is not None
+
+
+@pytest.mark.parametrize(
+    "fixed",
+    [{"lr": 0.2}, {"lr": 0.2, "gamma": 0.99}, {"lr": 0.2, "num_epochs": 6.0, "hidden_sizes": 64}],
+)
+def test_a_value_that_one_searches_and_another_fixes_or_writes_out_is_the_same(fixed: dict[str, Any]) -> None:
+    left = with_spec(
+        wanted("a", [5.0, 6.0], [50.0, 60.0], values=[0.1, 0.2]),
+        space={"lr": {"grid": [0.1, 0.2]}}, hyperparams={"hidden_sizes": [64]} if "hidden_sizes" in fixed else {},
+    )  # fmt: skip
+    right = without_points(with_spec(wanted("b", [55.0, 49.0]), space={}, hyperparams=fixed))
+    shared = present(the_pair(compare([left, right])).shared)
+    assert shared.num_settings == 1
+    # 50 and 60 beside 55 and 49.
+    assert shared.probability.mean == pytest.approx(3 / 4)
+
+
+def test_engines_and_versions_on_one_grid_have_their_settings_in_common() -> None:
+    left = with_spec(wanted("a", LEFT), engine="packed")
+    right = with_spec(wanted("b", RIGHT, versions={"torch": "9.9"}), engine="rllib")
+    assert present(the_pair(compare([left, right])).shared).num_settings == 1
+
+
+# -- the same trainings twice
+
+
+def beside_the_same(*rows: dict[str, Any], **other: Any) -> bool:
+    """Whether two sweeps are said to have the same numbers twice; all but the fields of `other` are equal.
+
+    Args:
+        *rows: The fields of the iterations of the one training.
+        **other: Fields of the last iteration of the other sweep.
+    """
+    left, right = wanted("a", [5.0]), wanted("b", [5.0])
+
+    def filled(one: Wanted, *items: dict[str, Any]) -> Wanted:
+        known = one.data.results["t0000"][0]
+        made = [known.model_copy(update={"iteration": i, **item}) for i, item in enumerate(items, start=1)]
+        return dataclasses.replace(
+            one, data=dataclasses.replace(one.data, trials=left.data.trials, results={"t0000": made})
+        )
+
+    pair = [filled(left, *rows), with_spec(filled(right, *rows[:-1], {**rows[-1], **other}), frame_stack=4)]
+    return any("1 training with the same hyperparameters" in note for note in compare(pair).notes)
+
+
+def test_only_trainings_of_equal_numbers_are_the_same_twice() -> None:
+    rows: list[dict[str, Any]] = [
+        {"num_env_steps": 1000, "episode_returns": (-200.0, math.nan), "learner": {"loss": 0.5, "kl": None}},
+        {"num_env_steps": 2000, "episode_returns": (-200.0,), "learner": {"loss": 0.25}},
+    ]
+    assert beside_the_same(*rows)
+    assert not beside_the_same(*rows, episode_returns=(-200.0, -200.0))
+    assert not beside_the_same(*rows, num_env_steps=2008)
+    assert not beside_the_same(*rows, evaluation_return=6.0)
+    # No episode has reached the goal, and the losses differ all the same.
+    assert not beside_the_same(*rows, learner={"loss": 0.26})
+    # One of them is evaluated less often, or still runs.
+    assert beside_the_same(*rows, evaluation_return=None)
+    assert beside_the_same(*rows, iteration=3)
+    assert not beside_the_same(rows[0], iteration=3)
+
+
+def test_evaluations_on_other_seeds_do_not_make_trainings_others() -> None:
+    left, right = wanted("a", [5.0]), wanted("b", [6.0], evaluation_seeds=(7, 8))
+    right = dataclasses.replace(right, data=dataclasses.replace(right.data, trials=left.data.trials))
+    alike = right.data.results["t0000"][0].model_copy(update={"training_return": 5.0})
+    right = dataclasses.replace(right, data=dataclasses.replace(right.data, results={"t0000": [alike]}))
+    assert any("numbers twice" in note for note in compare([left, right]).notes)
+    of_the_same = dataclasses.replace(
+        right, sweep=right.sweep.model_copy(update={"evaluation_seeds": left.sweep.evaluation_seeds})
+    )
+    assert not any("numbers twice" in note for note in compare([left, of_the_same]).notes)

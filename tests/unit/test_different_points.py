@@ -6,8 +6,12 @@ from typing import Any
 import pytest
 from spec_errors import MINIMAL
 
+from analysis.records import PriorPointRecord, PriorRecord
+from policies import random_streams
+from tests.narrowing import present
 from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.points import planned_points
+from tune_jobs.search.prior import with_prior
 from tune_jobs.search.proposal import next_point
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_first_points, draw_point, draw_points
@@ -126,3 +130,36 @@ def test_the_first_points_of_a_model_are_different() -> None:
     points = planned_points(spec)
     assert points[12:] == [None, None]
     assert len({repr(point) for point in points[:12]}) == 12
+
+
+def score(point: dict[str, Any]) -> float:
+    return -3.0 * abs([1e-4, 3e-4, 1e-3, 3e-3].index(point["lr"]) - 2) + float(point["activation"] == "tanh")
+
+
+def prior_of_all_points() -> list[PriorRecord]:
+    """An earlier sweep that had every point of the space, the worst first."""
+    points = sorted(draw_points(space_of(LISTS), NUM_POINTS, 9), key=score)
+    items = [PriorPointRecord(point=point, share=(place + 0.5) / NUM_POINTS) for place, point in enumerate(points)]
+    return [PriorRecord(sweep="first", env_id="CartPole-v1", points=tuple(items))]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("method", "num_random"), [("gp", 10), ("gp", 40), ("forest", 10)])
+def test_points_of_an_earlier_sweep_are_none_that_this_one_tried(method: str, num_random: int, seed: int) -> None:
+    """None comes twice, though the earlier sweep had all of them, and the model begins with what was best there."""
+    space, prior, known = space_of(LISTS), prior_of_all_points(), list[KnownPoint]()
+    for index in range(12):
+        told = with_prior(known, prior)
+        point = next_point(method, space, told, index, seed=seed, num_startup_trials=num_random)
+        known.append(KnownPoint(point, scores=(score(point),)))
+    assert set(counts([dict(item.point) for item in known]).values()) == {1}
+    if num_random < NUM_POINTS:
+        assert max(present(item.score) for item in known[:3]) == score(prior[0].points[-1].point)
+
+
+def test_every_fifth_point_of_a_forest_is_random_though_an_earlier_sweep_had_it() -> None:
+    space, told = space_of(LISTS), with_prior([], prior_of_all_points())
+    indices = [index for index in range(30) if random_streams.model_draws(0, index).random() < 0.2]
+    assert len(indices) > 2
+    for index in indices:
+        assert next_point("forest", space, told, index, seed=0) == draw_point(space, index, 0)

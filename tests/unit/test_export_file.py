@@ -18,7 +18,8 @@ from sweep_folders import make_sweep_folder
 from synthetic_sweep import make_points, make_sweep
 
 import tune_jobs
-from analysis.records import IterationRecord
+from analysis.records import IterationRecord, JobRecord
+from analysis.waits import WaitRecord
 from policies.errors import SpecError
 from tune_jobs.cli.commands import cli
 from tune_jobs.store.sweep_store import SweepStore
@@ -222,6 +223,39 @@ see https://example.org/a/b?c=d or ~/notes/cart.md; 3/4 env steps/s"""
         "see https://example.org/a/b?c=d or …/cart.md; 3/4 env steps/s",
     ]
     assert {item["node"] for item in content_of(packed)["trials"]} == {"node 1", "node 2"}
+
+
+def test_no_address_of_a_cluster_leaves_it(tmp_path: Path) -> None:
+    store = write_finished(tmp_path, failed={1}, error="EnvError: 10.1.2.7:80 of http://10.1.2.7/x; not 10.1.2.70")
+    # Another trial ran on node 5.
+    told = (
+        # The node that each is on now; one that it was on before, and one that it never ran on.
+        ("10.1.2.7/0a1b2c3d", ("Node 10.1.2.7 (0a1b2c3d) was lost.",)),
+        ("127.0.0.1/0a1b2c3e", ("Node 10.1.2.8 (0a1b2c3f) was lost.", "127.0.0.1:80 is nobody's, 10.1.2.8 is.")),
+        ("10.1.2.7/ffffffff", ("Node 10.1.2.9 (gpu-9.example.org, node 0a1b2c40) cannot take part in the sweep.",)),
+        (
+            "worker/0a1b2c41",
+            ("A worker died on Node worker (0a1b2c41).", "Node 10.1.2.8 is full", "Node 5 (of a graph)"),
+        ),
+    )
+    for trial, (node, notes) in zip(store.read_trials(), told, strict=False):
+        store.trial(trial.trial_id).write_record(trial.model_copy(update={"node": node, "notes": notes}))
+    job = JobRecord(id="mine-1a2b", address="http://head.example.org:8265")
+    waiting = WaitRecord(since=1.0, lacking="One trial needs 4 CPUs; the cluster at ray://10.1.2.3:10001 has 2.")
+    store.write_record(store.read_record().model_copy(update={"job": job, "waiting": waiting}))
+    packed = sweep_file(store)
+    text = gzip.decompress(packed).decode()
+    for word in ("10.1.2.7:", "10.1.2.7/", "10.1.2.8", "10.1.2.9", "10.1.2.3", "example.org", "0a1b2c", "mine-1a2b"):
+        assert word not in text, word
+    found = content_of(packed)
+    assert {"job", "waiting"} & set(found["sweep"]) == set()
+    assert [(item["node"], item["notes"]) for item in found["trials"][:4]] == [
+        ("node 1", ["Node 1 was lost."]),
+        ("node 2", ["Node 6 was lost.", "127.0.0.1:80 is nobody's, node 6 is."]),
+        ("node 3", ["Node 7 cannot take part in the sweep."]),
+        ("node 4", ["A worker died on Node 4.", "Node 6 is full", "Node 5 (of a graph)"]),
+    ]
+    assert found["trials"][1]["error"] == "EnvError: node 1:80 of http://node 1/x; not 10.1.2.70"
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analysis.exports.frames import SweepData, settings_frame
 from analysis.front import NEAR, front_of, points_on_front, untrained_return
 from analysis.front_words import cheapest_near_text, front_rows, near_text, undecided_text
 from analysis.objectives import SettingScores, env_steps_of, score_of
@@ -230,3 +231,71 @@ def test_many_settings_take_no_time_to_speak_of() -> None:
     found = present(front_of(ranked(*items), 0.0))
     costs = [item.num_env_steps for item in found.points]
     assert all(one < two for one, two in itertools.pairwise(costs))
+
+
+def of_lengths(
+    *rows: tuple[float, int, float | None, TrialStatus],
+) -> tuple[list[TrialRecord], dict[str, list[IterationRecord]]]:
+    """Trials of lr, the length that was searched, what they scored (None: no whole episode), and how they ended."""
+    trials, results = [], {}
+    for index, (lr, length, score, status) in enumerate(rows):
+        point = {"lr": lr, TRAINING_LENGTH: length}
+        record = trial(status, length if status == "completed" else 0, point, index, "num_env_steps")
+        trials.append(record)
+        returns = [] if score is None else [(length // 4, 20.0, 20), (length, score, 100)]
+        results[record.trial_id] = [
+            IterationRecord(
+                iteration=i, num_env_steps=steps, num_episodes=0, time_s=0.0, evaluation_return=told,
+                episode_returns=(told,) * number,
+            )
+            for i, (steps, told, number) in enumerate(returns, start=1)
+        ]  # fmt: skip
+    return trials, results
+
+
+CRASHED: tuple[float, int, float | None, TrialStatus] = (0.5, 5_000, None, "failed")
+EASY: tuple[tuple[float, int, float | None, TrialStatus], ...] = (
+    (1e-3, 100_000, 500.0, "completed"), (3e-3, 80_000, 495.0, "completed"), (1e-4, 60_000, 490.0, "completed"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("unscored", [CRASHED, (0.5, 5_000, None, "completed")])
+def test_a_short_setting_without_a_score_of_its_own_is_not_the_cheapest_near_the_best(
+    unscored: tuple[float, int, float | None, TrialStatus],
+) -> None:
+    trials, results = of_lengths(*EASY, unscored)
+    found = present(judge_settings(trials, results, num_env_steps=100_000, threshold=475.0, cost="env_steps"))
+    front = present(found.front)
+    assert front.cheapest_near.point["lr"] == 1e-4
+    assert [item.point["lr"] for item in front.points] == [1e-4, 3e-3, 1e-3]
+    assert front.undecided == ()
+    # It keeps its place in the ranking, behind who has earned the same score.
+    assert [item.point["lr"] for item in found.ranking] == [1e-3, 3e-3, 1e-4, 0.5]
+    frame = settings_frame(SweepData(trials, results, "final", num_env_steps=100_000, threshold=475.0))
+    assert frame["on_front"].tolist() == [True, True, True, False]
+
+
+def test_a_short_setting_that_only_crashed_hides_none_that_has_the_worst_score() -> None:
+    rows: list[tuple[float, int, float | None, TrialStatus]] = [
+        (1e-3, 100_000, 500.0, "completed"), (3e-3, 60_000, 300.0, "completed"), (1e-4, 10_000, 100.0, "completed"),
+    ]  # fmt: skip
+    trials, results = of_lengths(*rows, CRASHED)
+    found = present(judge_settings(trials, results, num_env_steps=100_000, threshold=475.0, cost="env_steps"))
+    assert [item.point["lr"] for item in present(found.front).points] == [1e-4, 3e-3, 1e-3]
+
+
+def test_a_setting_of_which_one_seed_of_several_failed_stays_on_the_front() -> None:
+    trials, results = of_lengths(*EASY, (0.5, 5_000, 480.0, "completed"), CRASHED)
+    trials[-1] = trials[-1].model_copy(update={"point_index": 3, "seed_index": 1})
+    found = present(judge_settings(trials, results, num_env_steps=100_000, threshold=475.0, cost="env_steps"))
+    assert present(found.front).points[0].point["lr"] == 0.5
+
+
+def test_settings_of_which_none_was_scored_have_no_front() -> None:
+    failed = [dataclasses.replace(setting(index, [1.0, 1.0], 100, 100), num_unscored=2) for index in range(2)]
+    assert front_of(failed, 0.0) is None
+    assert points_on_front(failed) == set()
+    # Those that can't be told from it are such as were scored, too.
+    items = [setting(0, [9.0, 11.0], 500, 500), setting(1, [8.0, 10.0], 500, 500), *failed]
+    found = present(front_of(ranked(*items[:2], dataclasses.replace(failed[0], point_index=2)), 0.0))
+    assert [item.point_index for item in found.undecided] == [1]

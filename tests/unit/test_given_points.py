@@ -12,6 +12,8 @@ from policies.errors import SpecError
 from tune_jobs.cli.commands import cli
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
+from tune_jobs.search import chosen_point
+from tune_jobs.search.given_points import given_points
 from tune_jobs.spec.file import load_spec, stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.sweep_store import SweepStore
@@ -90,6 +92,29 @@ def test_a_wrong_point_is_refused_with_its_place(points: Any, words: list[str]) 
         make_plan(make_spec(points), MACHINE)
     assert all(word in caught.value.message for word in words), caught.value.message
     assert "lr (loguniform" in caught.value.hint
+
+
+def test_what_a_point_means_is_asked_once_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compared with each other one by one, a few hundred took seconds."""
+    asked: list[Any] = []
+
+    def count(spec: SweepSpec, point: Any) -> str | None:
+        asked.append(point)
+        return meaning(spec, point)
+
+    meaning = chosen_point._meaning
+    monkeypatch.setattr(chosen_point, "_meaning", count)
+    points = [{"lr": 1e-6 * number, "hidden_sizes": 64} for number in range(1, 1_001)]
+    assert len(given_points(make_spec(points))) == 1_000
+    assert len(asked) == 1_000
+    with pytest.raises(SpecError, match=r"points\[1000\]: it has the values of points\[7\]"):
+        given_points(make_spec([*points, {"lr": 8e-6, "hidden_sizes": [64]}]))
+
+
+def test_equal_values_are_the_same_point_though_their_texts_differ() -> None:
+    space = {"entropy_coeff": {"uniform": [0.0, 0.1]}}
+    with pytest.raises(SpecError, match=r"points\[1\]: it has the values of points\[0\]"):
+        given_points(make_spec([{"entropy_coeff": 0.0}, {"entropy_coeff": -0.0}], space=space))
 
 
 def test_a_point_that_the_grid_has_too_is_told_in_whatever_form_it_is_given() -> None:

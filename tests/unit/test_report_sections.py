@@ -10,7 +10,7 @@ import yaml
 from report_sources import source_of
 from synthetic_sweep import Synthetic, make_points, make_sweep
 
-from analysis.page import all_trials, cost, next_steps, repeat
+from analysis.page import all_trials, cost, head, next_steps, repeat
 from analysis.page.narrowed import narrowed_space
 from analysis.page.next_steps import Step
 from analysis.records import TrialRecord
@@ -54,6 +54,19 @@ def test_the_cost_of_a_pack_is_shared_by_its_trials() -> None:
     table = all_trials.section(source_of(synthetic)).table
     column = table.headings.index("core-seconds")
     assert [row[column].text for row in table.rows] == ["5.0", "5.0"]
+
+
+@pytest.mark.parametrize(
+    ("state", "run_time_s", "said"),
+    [("running", 0.0, None), ("running", 70.4, "1 min 10 s before this run"), ("interrupted", 70.4, "1 min 10 s")],
+)
+def test_the_time_of_a_run_under_way_is_not_said_to_be_none(state: str, run_time_s: float, said: str | None) -> None:
+    synthetic = make_sweep(points=[{"lr": 1e-7}], with_best=False)
+    synthetic.sweep = synthetic.sweep.model_copy(update={"state": state, "run_time_s": run_time_s})
+    source = source_of(synthetic)
+    assert dict(head.section(source).facts).get("wall time") == said
+    assert dict(repeat.section(source).facts).get("time in all") == said
+    assert dict(cost.section(source).facts).get("wall time") == said
 
 
 def test_a_trial_in_a_process_of_its_own_is_not_called_an_estimate() -> None:
@@ -118,6 +131,15 @@ def test_next_steps_are_commands_and_sweep_files_that_can_be_launched() -> None:
     assert load_spec(narrower).num_samples == 5
     low, high = narrower["space"]["lr"]["loguniform"]
     assert 1e-7 < low < settings.best.point["lr"] < high <= 1e-2
+
+
+def test_next_steps_keep_all_arguments_of_the_environment() -> None:
+    args = {"map_name": None, "x": {}, "y": {"z": None}}
+    steps = steps_of(with_spec(ppo_sweep(), env={"id": "CartPole-v1", "args": args, "frame_stack": 1, "atari": None}))
+    for title in ("Search a narrower space", "Train the setting by itself"):
+        content = yaml.safe_load(steps[title].text)
+        assert content["env"] == {"id": "CartPole-v1", "args": args, "frame_stack": 1}
+        assert load_spec(content).env.args == args
 
 
 def test_next_steps_leave_out_the_earlier_sweeps_that_a_search_began_with() -> None:

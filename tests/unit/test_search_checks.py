@@ -1,5 +1,6 @@
 """Search methods and schedulers that don't go with the rest of a sweep; plans whose points are chosen later."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +205,40 @@ def test_values_that_a_population_changed_are_no_other_sweep_but_others_are(tmp_
     trial.write_record(known.model_copy(update={**changed, "changes": ()}))
     with pytest.raises(CannotRunError, match="t0001"):
         check_same_trials(store, plan)
+
+
+@pytest.mark.parametrize("fixed", [{}, {"prioritized_alpha": 0.3}])
+def test_values_that_did_not_act_before_a_population_gave_them_are_no_other_sweep(
+    tmp_path: Path, fixed: dict[str, Any]
+) -> None:
+    space = {
+        "replay": {"choice": ["uniform", "prioritized"]},
+        "prioritized_alpha": {"uniform": [0.5, 1.0], "when": {"replay": "prioritized"}},
+    }
+    store, plan = written(tmp_path, {**PBT, "algorithm": "dqn", "hyperparams": fixed, "space": space})
+    index = next(index for index, trial in enumerate(plan.trials) if trial.point == {"replay": "uniform"})
+    known, trial = pending_record(plan.trials[index]), store.trial(f"t{index:04d}")
+    assert known.hyperparams.items() >= fixed.items()
+    points = [known.point, {"replay": "prioritized", "prioritized_alpha": 0.9}, {"replay": "uniform"}]
+    changes = tuple(
+        ChangeRecord(
+            iteration=3 * at, num_env_steps=30 * at, source_trial_id="t0000", source_iteration=2, before=before,
+            after=after, time=0.0,
+        )
+        for at, (before, after) in enumerate(itertools.pairwise(points), start=1)
+    )  # fmt: skip
+    for number in (1, 2):
+        hyperparams = {**known.hyperparams, **points[number]}
+        changed = {"point": points[number], "hyperparams": hyperparams, "changes": changes[:number]}
+        trial.write_record(known.model_copy(update=changed))
+        check_same_trials(store, plan)
+        trial.write_record(known.model_copy(update={**changed, "hyperparams": {**hyperparams, "gamma": 0.5}}))
+        with pytest.raises(CannotRunError, match=f"t{index:04d}"):
+            check_same_trials(store, plan)
+        other = changes[0].model_copy(update={"before": {"replay": "prioritized"}})
+        trial.write_record(known.model_copy(update={**changed, "changes": (other, *changes[1:number])}))
+        with pytest.raises(CannotRunError, match=f"t{index:04d}"):
+            check_same_trials(store, plan)
 
 
 def test_more_combinations_of_sizes_than_can_be_looked_at_are_refused() -> None:

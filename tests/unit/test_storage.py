@@ -15,10 +15,11 @@ from policies.guard.guard import EnvGuard
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
+from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import verbs as sweeps
 from tune_jobs.sweeps.drive import write_new
-from tune_jobs.sweeps.storage import create_store, storage_place
+from tune_jobs.sweeps.storage import choose_store, create_store, storage_place
 
 
 def test_sweeps_that_begin_at_once_get_a_name_each(tmp_path: Path) -> None:
@@ -142,3 +143,34 @@ def test_where_the_working_directory_was_deleted_whole_paths_do(
     (tmp_path / "gone").rmdir()
     assert sweeps.list_sweeps(tmp_path) == []
     assert shown_path(tmp_path / "index.html") == str(tmp_path / "index.html")
+
+
+def test_a_link_to_what_is_not_there_takes_its_name(tmp_path: Path) -> None:
+    """Such as one to a disk that is not mounted: no folder can be made there, however often it is tried."""
+    storage = tmp_path / "sweeps"
+    storage.mkdir()
+    (storage / "cartpole").symlink_to("/mnt/big/cartpole")
+    assert open_storage(storage).is_taken("cartpole")
+    assert create_store(None, "cartpole", storage).name == "cartpole-2"
+    choices: list[Callable[[], object]] = [
+        lambda: create_store("cartpole", "x", storage),
+        lambda: choose_store("cartpole", "x", storage),
+    ]
+    for choose in choices:
+        with pytest.raises(SpecError, match="is a link, and what it leads to isn't there: /mnt/big/cartpole") as caught:
+            choose()
+        assert "--name" in caught.value.hint
+    # One that leads to itself is nothing either, and one to a folder is that folder.
+    (storage / "loop").symlink_to(storage / "loop")
+    (storage / "there").symlink_to(tmp_path)
+    assert [create_store(None, name, storage).name for name in ("loop", "there")] == ["loop-2", "there-2"]
+    with pytest.raises(SpecError, match="A sweep 'there' is already in"):
+        choose_store("there", "x", storage)
+
+
+def test_after_a_file_that_is_called_as_a_baseline_a_sweep_has_a_longer_name(tmp_path: Path) -> None:
+    assert choose_store(None, "constant", tmp_path).name == "constant-sweep"
+    assert [create_store(None, "random", tmp_path).name for _ in range(2)] == ["random-sweep", "random-sweep-2"]
+    for choose in (choose_store, create_store):
+        with pytest.raises(SpecError, match="The sweep name 'random' is not allowed"):
+            choose("random", "x", tmp_path)

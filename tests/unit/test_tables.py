@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from synthetic_sweep import Synthetic, make_sweep
 
-from analysis.records import IterationRecord, TrialRecord
+from analysis.records import ChangeRecord, IterationRecord, TrialRecord
 from analysis.selection import score_trial
 from analysis.tables import (
     cell_value,
@@ -100,6 +100,32 @@ def test_solved_needs_the_return_and_a_hundred_episodes() -> None:
     assert env_steps_to(200.0, rows[1:]) is None
     assert env_steps_to(None, rows) is None
     assert env_steps_to(0.0, [iteration(1, episodes=100, training=0.0)]) == 1000
+
+
+def test_after_a_copy_solved_needs_a_hundred_episodes_since_then() -> None:
+    """The training return of a population's trial is of what it played since it went on from a copy."""
+    rows = [
+        iteration(number, episodes=60 * number, training=200.0 if number > 2 else 100.0).model_copy(
+            update={"episode_returns": (200.0,) * 60}
+        )
+        for number in range(1, 9)
+    ]
+    assert env_steps_to(195.0, rows) == 3000
+    # Two iterations have a hundred episodes; a change after an iteration leaves that one to what was before.
+    assert env_steps_to(195.0, rows, changed_at=[2]) == 4000
+    assert env_steps_to(195.0, rows, changed_at=[3]) == 3000
+    assert env_steps_to(195.0, rows, changed_at=[3, 2]) == 3000 + 2000
+    assert env_steps_to(195.0, rows, changed_at=range(2, 8)) is None
+    assert env_steps_to(195.0, rows, num_episodes=60, changed_at=[2, 3]) == 3000
+    change = ChangeRecord(
+        iteration=2, num_env_steps=2000, source_trial_id="t0001", source_iteration=2, before={"lr": 0.1},
+        after={"lr": 0.2}, time=0.0,
+    )  # fmt: skip
+    trial = TrialRecord(trial_id="t0000", index=0, point_index=0, seed=0, point={"lr": 0.2}, status="completed")
+    for changes, steps in [((), 3000), ((change,), 4000)]:
+        given = [trial.model_copy(update={"changes": changes})], {"t0000": rows}
+        assert trials_frame(*given, threshold=195.0)["num_env_steps_to_solve"].tolist() == [steps]
+        assert steps_to_solve_frame(*given, threshold=195.0)["median_num_env_steps"].tolist() == [steps]
 
 
 def test_no_trials_give_an_empty_table_with_its_columns() -> None:

@@ -273,7 +273,7 @@ def evaluate(
     from tune_jobs.sweeps import verbs as sweeps
 
     here_only()
-    _check_baseline(source, env_id)
+    _check_baseline(source, env_id, storage)
     with stdout_for(as_json=as_json):
         policy, random = sweeps.evaluate(
             source,
@@ -315,7 +315,7 @@ def video(
     from tune_jobs.cli import output as cli_output
 
     sweeps = verbs()
-    _check_baseline(source, env_id)
+    _check_baseline(source, env_id, storage)
     with stdout_for(as_json=as_json):
         paths = sweeps.video(
             source, storage=storage, output=output, seed=seed, env_id=env_id, action=action, progress=progress
@@ -323,9 +323,14 @@ def video(
     cli_output.show_paths(paths, as_json=as_json)
 
 
-def _check_baseline(source: str, env_id: str | None) -> None:
+def _check_baseline(source: str, env_id: str | None, storage: str | None) -> None:
     if source in ("random", "constant") and env_id is None:
-        raise SpecError(f"A {source} policy has no environment of its own.", "Add --env, such as --env CartPole-v1.")
+        from tune_jobs.sweeps.sources import names_baseline
+
+        if names_baseline(source, storage):
+            raise SpecError(
+                f"A {source} policy has no environment of its own.", "Add --env, such as --env CartPole-v1."
+            )
 
 
 for _command in (attach, compare, export, importance, inject, report, reproduce, serve, token):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from analysis.points import searched_names, value_text
 from analysis.selection import score_trial
+from analysis.tables import shown_point
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, setting_text
 from policies.errors import SpecError
 from policies.suggestions import did_you_mean
@@ -212,13 +213,14 @@ def _plain(name: str) -> str:
 
 def _names_of_points(trials: Sequence[TrialRecord]) -> list[str]:
     """Return the searched hyperparameters, those that differ among these trials first."""
-    names = searched_names(trial.point for trial in trials)
-    values = {name: {value_text(trial.point, name) for trial in trials} for name in names}
+    points = [shown_point(trial) for trial in trials]
+    names = searched_names(points)
+    values = {name: {value_text(point, name) for point in points} for name in names}
     return sorted(names, key=lambda name: len(values[name]) == 1)
 
 
 def _point_column(name: str) -> _Column:
-    return _Column(name, lambda trial: trial.point.get(name), lambda trial: value_text(trial.point, name))
+    return _Column(name, lambda trial: shown_point(trial).get(name), lambda trial: value_text(shown_point(trial), name))
 
 
 def _score_order(trial: TrialRecord) -> tuple[float, int] | None:

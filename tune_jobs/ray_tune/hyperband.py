@@ -14,7 +14,7 @@ already; and, after the first halving, if the last trial that others wait for fa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from ray.tune.experiment import Trial
 from typing_extensions import override
 
+from analysis.records import TrialRecord
 from tune_jobs.ray_tune.scheduling import Decision, Others, Standing, is_unscored
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler, is_starting, name_of
 
@@ -73,8 +74,22 @@ class HyperBand:
         self._bracket_of: dict[str, _Bracket] = {}
         self._to_end: list[str] = []
 
+    def begin(self, records: Sequence[TrialRecord], todo: Collection[str]) -> None:
+        """Add the trials of a run, in the order of the records, which have those that ended before it, too.
+
+        Nobody waits for these, but they had places: without them, the others of a sweep that is resumed would be in
+        other brackets than they began in, and the best of a bracket compared with each other as if none had ended.
+        """
+        for record in records:
+            self.begins(record.trial_id)
+        for record in records:
+            if record.trial_id not in todo:
+                self.gone(record.trial_id)
+
     def begins(self, trial_id: str) -> None:
-        """Add a trial to the newest bracket, or to a new one if that is full."""
+        """Add a trial to the newest bracket, or to a new one if that is full; one that was added has its place."""
+        if trial_id in self._bracket_of:
+            return
         band = self._bands[-1]
         if not band or band[-1].is_full:
             if len(band) == self._num_kinds:
@@ -186,6 +201,10 @@ class HyperBandScheduler(TuneScheduler):
     def __init__(self, scheduler: HyperBand) -> None:
         super().__init__(scheduler)
         self._band = scheduler
+
+    def begin(self, records: Sequence[TrialRecord], todo: Collection[str]) -> None:
+        """Add the trials of a run before Tune does; see `HyperBand.begin`."""
+        self._band.begin(records, todo)
 
     @override
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:

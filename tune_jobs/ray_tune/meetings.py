@@ -6,10 +6,11 @@ it is to be compared with, the outcomes say what becomes of each. Nothing here d
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from analysis.records import FINISHED, TrialRecord
 from tune_jobs.ray_tune.hyperband import HyperBand
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import CopyFrom, Decision, NobodyWaits, Scheduler, Standing
@@ -19,6 +20,15 @@ Outcome = Decision | CopyFrom
 
 class Meeting(Scheduler, Protocol):
     """A scheduler for members of packs that wait for each other. All trials begin before any other call."""
+
+    def begin(self, records: Sequence[TrialRecord], todo: Collection[str]) -> None:
+        """Add the trials of a run, in the order of the records.
+
+        Args:
+            records: The trials, and those that ended before this run and were compared with them; see `compared_with`.
+            todo: The ids of the trials.
+        """
+        ...
 
     def due_at(self, trial_id: str) -> int | None:
         """Return the env steps from which a trial waits, at its next evaluation; None: it waits no more."""
@@ -39,6 +49,25 @@ class Meeting(Scheduler, Protocol):
     def take_outcomes(self) -> dict[str, Outcome]:
         """Return what becomes of those that waited, each once: it goes on, ends, or goes on from another's copy."""
         ...
+
+
+def compared_with(
+    trial_ids: Collection[str], records: Sequence[TrialRecord], seeds_per_point: int
+) -> list[TrialRecord]:
+    """Return the records of trials of a run, and of those that ended before it and were compared with them.
+
+    Args:
+        trial_ids: The trials.
+        records: Of all trials of the sweep, in their order, which is that of what is returned.
+        seeds_per_point: The seeds of a point that are trained for the search; nobody compares further ones.
+    """
+    engines = {record.engine for record in records if record.trial_id in trial_ids}
+    return [
+        record
+        for record in records
+        if record.trial_id in trial_ids
+        or (record.status in FINISHED and record.engine in engines and record.seed_index < seeds_per_point)
+    ]
 
 
 def meeting_of(scheduler: Scheduler) -> Meeting | None:
@@ -78,6 +107,12 @@ class PopulationMeeting:
         self._live: dict[str, Standing | None] = {}
         """The trials that have not ended, in the order in which they began; None: it has not arrived."""
         self._gone: set[str] = set()
+
+    def begin(self, records: Sequence[TrialRecord], todo: Collection[str]) -> None:
+        """Add the trials of a run; whoever has ended is compared no more."""
+        for record in records:
+            if record.trial_id in todo:
+                self.begins(record.trial_id)
 
     def begins(self, trial_id: str) -> None:
         """Add a trial to the population."""
@@ -130,6 +165,10 @@ class HyperBandMeeting:
         self._band = band
         self._waiting: dict[str, None] = {}
         self._outcomes: dict[str, Outcome] = {}
+
+    def begin(self, records: Sequence[TrialRecord], todo: Collection[str]) -> None:
+        """Give the trials of a run the places in brackets that they have among all of the search."""
+        self._band.begin(records, todo)
 
     def begins(self, trial_id: str) -> None:
         """Give a trial a place in a bracket."""

@@ -22,7 +22,7 @@ from typing import Any
 
 from policies.errors import CheckpointError
 from tune_jobs.plan.engine_choice import PackPlan
-from tune_jobs.ray_tune.meetings import meeting_of
+from tune_jobs.ray_tune.meetings import compared_with, meeting_of
 from tune_jobs.ray_tune.pack_failures import PackFailures
 from tune_jobs.ray_tune.pack_state import PackState, Tell
 from tune_jobs.ray_tune.population import take_over
@@ -81,8 +81,8 @@ class PackDriver:
         """Those of them that have given their place to a trial that had none."""
         if self._meeting is not None:
             # The order in which they get places must not decide whom a trial is compared with.
-            for trial_id in sorted(trial_ids, key=lambda name: keeper.record(name).index):
-                self._meeting.begins(trial_id)
+            todo = set(trial_ids)
+            self._meeting.begin(compared_with(todo, keeper.all_records(), spec.seeds_per_point), todo)
         num_packs = min(plan.num_packs, len(trial_ids))
         num_waiting = max(0, len(trial_ids) - num_packs * self._slots)
         num_more = min(more_packs, math.ceil(num_waiting / self._slots))

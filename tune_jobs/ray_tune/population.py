@@ -15,6 +15,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
 from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, is_starting, name_of, standing_of
 from tune_jobs.search.bandit import Next, propose
+from tune_jobs.search.comparisons import Comparison, last_over, made_together
 from tune_jobs.search.gains import Curves, Evaluations, gains_of
 from tune_jobs.search.mutation import mutate
 from tune_jobs.search.subpopulations import Migration, Ranked, migrations, subpopulation_of
@@ -63,6 +65,8 @@ class _Compared:
     """The number of the sub-population with which it is compared."""
     selected_from: int
     """Env steps from which the interval to the next selection of its sub-population counts."""
+    before: Sequence[int] = ()
+    """Env steps of its comparisons before the sweep was resumed."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,8 @@ class Population:
         curves: Returns the evaluations of trials, by which pb2 chooses values; None: values are mutated.
         all_records: Returns the newest record of every trial of the sweep, including those of earlier runs, which don't
             begin again but are what pb2 knows; None: all trials begin in this run.
+        before: The comparisons of trials that have trained already, before the sweep was resumed; of one that lacks,
+            they are taken to have been at the multiples of the interval.
     """
 
     def __init__(
@@ -93,9 +99,12 @@ class Population:
         read: ReadRecord,
         curves: ReadCurves | None = None,
         all_records: ReadRecords | None = None,
+        *,
+        before: Mapping[str, Sequence[Comparison]] = MappingProxyType({}),
     ) -> None:
         self._spec = spec
         self._read = read
+        self._before = before
         self._curves = curves
         self._all_records = all_records
         self._frequencies = spec.scheduler.frequencies
@@ -106,28 +115,32 @@ class Population:
         """The points of trials that are copied to in this comparison, which their records may not have yet."""
 
     def begins(self, trial_id: str) -> None:
-        """Add a trial to the population, with the env steps of its record, as a resumed trial has some already."""
+        """Add a trial to the population, with what it has trained already in a sweep that is resumed."""
         record, interval = self._read(trial_id), self._spec.perturb_every_env_steps
-        score = WORST_SCORE if record.evaluation_return is None else record.evaluation_return
-        steps, own = record.num_env_steps, subpopulation_of(record.index, len(self._frequencies))
-        due_from, selected_from = (steps // each * each for each in (interval, self._frequencies[own] * interval))
-        self._members[trial_id] = _Compared(steps, due_from, score if steps else None, own, selected_from)
+        own = subpopulation_of(record.index, len(self._frequencies))
+        member = self._members[trial_id] = _Compared(record.num_env_steps, 0, None, own, 0)
+        known = self._before.get(trial_id)
+        if known is not None:
+            self._count_from(member, [each.num_env_steps for each in known])
+            member.score = _score_of(known[-1].score) if known else None
+        elif record.num_env_steps:
+            self._count_from(member, range(interval, record.num_env_steps + 1, interval))
+            member.score = _score_of(record.evaluation_return)
+
+    def _count_from(self, member: _Compared, before: Sequence[int]) -> None:
+        """Let a member have been compared at these env steps."""
+        member.before, member.due_from = before, before[-1] if before else 0
+        own = self._frequencies[member.subpopulation] * self._spec.perturb_every_env_steps
+        member.selected_from = last_over(before, own)
 
     def in_step(self) -> None:
-        """Let trials that are where they wait for the others be compared there, in a sweep that is resumed.
-
-        Where all are compared at once, nobody is trained beyond the next comparison. So the last one was where those
-        who are furthest behind come from, or a later one that changed somebody, as records may be older than changes.
-        """
-        interval = self._spec.perturb_every_env_steps
-        changes = [change.num_env_steps for name in self._members for change in self._read(name).changes]
-        known = {member.due_from for member in self._members.values()}
-        last = max(min(known), max(changes, default=0) // interval * interval)
-        if not known <= {last - interval, last, last + interval}:
-            return  # some were added, and are compared when they have come as far as they have to
-        for member in self._members.values():
-            own = self._frequencies[member.subpopulation] * interval
-            member.due_from, member.selected_from = last, last // own * own
+        """Let trials that are where they wait for the others be compared there, in a sweep that is resumed."""
+        places = {name: member.before for name, member in self._members.items()}
+        changes = {name: self._read(name).changes for name in places}
+        made = made_together(places, {name: known[-1].num_env_steps for name, known in changes.items() if known})
+        # Some may have been added, and are compared when they have come as far as they have to.
+        for name, own in ({} if made is None else made).items():
+            self._count_from(self._members[name], own)
 
     def compared_at(self, trial_id: str) -> int:
         """Return the env steps at which a trial was compared last, or at which it began if it never was."""
@@ -228,6 +241,10 @@ class Population:
         return point
 
 
+def _score_of(evaluation_return: float | None) -> float:
+    return WORST_SCORE if evaluation_return is None else evaluation_return
+
+
 def _score(member: _Compared) -> float:
     assert member.score is not None
     return member.score
@@ -280,6 +297,7 @@ class PopulationScheduler(TuneScheduler):
         read: Returns the newest record of a trial.
         change: Changes a trial's record, on disk too.
         all_records: As for `Population`.
+        before: As for `Population`.
     """
 
     def __init__(
@@ -290,9 +308,10 @@ class PopulationScheduler(TuneScheduler):
         change: Change,
         *,
         all_records: ReadRecords | None = None,
+        before: Mapping[str, Sequence[Comparison]] = MappingProxyType({}),
     ) -> None:
         curves = Evaluations(store) if spec.scheduler.type == "pb2" else None
-        self._population = Population(spec, read, curves, all_records)
+        self._population = Population(spec, read, curves, all_records, before=before)
         super().__init__(self._population)
         self._spec = spec
         self._store = store

@@ -27,8 +27,10 @@ from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import going_on
+from tune_jobs.ray_tune.hyperband import HyperBandScheduler
 from tune_jobs.ray_tune.lean import lean_run
 from tune_jobs.ray_tune.lost_nodes import NodeLosses
+from tune_jobs.ray_tune.meetings import compared_with
 from tune_jobs.ray_tune.pack_driver import PackDriver
 from tune_jobs.ray_tune.pack_scheduler import PackScheduler
 from tune_jobs.ray_tune.pack_trainable import PackTrainable
@@ -41,6 +43,7 @@ from tune_jobs.ray_tune.searcher import PointChooser, PointSearcher, TrialsInOrd
 from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.ray_tune.tune_events import PackEvents, TrialEvents, pack_id_of, trial_id_of
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
+from tune_jobs.search.comparisons import comparisons_before
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
@@ -190,8 +193,9 @@ class _Run:
     def _build_scheduler(self) -> TrialScheduler:
         if self._spec.scheduler.is_population:
             keeper = self.keeper
+            before = comparisons_before(self._store, self._spec, list(map(keeper.record, self._job.trial_ids)))
             return PopulationScheduler(
-                self._spec, self._store, keeper.record, keeper.change, all_records=keeper.all_records
+                self._spec, self._store, keeper.record, keeper.change, all_records=keeper.all_records, before=before
             )
         return build_tune_scheduler(self._spec.scheduler, self._spec.stop.num_env_steps)
 
@@ -234,6 +238,9 @@ class _Run:
         """Run single trials, as many at once as fit."""
         spec, job = self._spec, self._job
         param_space: dict[str, Any] = dict(self._config)
+        if isinstance(self._scheduler, HyperBandScheduler):
+            todo = set(trial_ids)
+            self._scheduler.begin(compared_with(todo, self.keeper.all_records(), spec.seeds_per_point), todo)
         losses = NodeLosses(self._reached, self._watch.check_after)
         events = TrialEvents(self._store, self.keeper, spec.iteration_timeout_s, self._watch, losses)
         resources = _resources(spec, job)

@@ -103,7 +103,7 @@ def _point_at(cube: Cube, question: Question, place: Floats) -> dict[str, Any]:
 def _first_valid(
     cube: Cube, question: Question, places: Floats, rng: np.random.Generator, check: Check
 ) -> dict[str, Any]:
-    tried = [point.point for point in question.known]
+    tried = [point.point for point in question.known if point.is_own]
     seen: list[dict[str, Any]] = []
     repeated: dict[str, Any] | None = None
     last_error: SpecError | None = None

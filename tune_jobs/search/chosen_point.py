@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -117,9 +117,20 @@ def trial_of_point(spec: SweepSpec, point: Mapping[str, Any], trials: Sequence[T
     return next((trial for trial in known if trial.point == point or _meaning(spec, trial.point) == meant), None)
 
 
-def same_point(spec: SweepSpec, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two points have the same values, in whatever form."""
-    return one == other or (_meaning(spec, one) == _meaning(spec, other) is not None)
+def keys_of(spec: SweepSpec, point: Mapping[str, Any]) -> list[Hashable]:
+    """Return keys of a point; points that have the same values, in whatever form, have one of them in common."""
+    meant = _meaning(spec, point)
+    return [_hashable(point), *([] if meant is None else [meant])]
+
+
+def _hashable(value: Any) -> Hashable:
+    """Return what is equal for equal values, and can be a key."""
+    if isinstance(value, Mapping):
+        return frozenset((name, _hashable(item)) for name, item in value.items())
+    if isinstance(value, list | tuple):
+        return tuple(map(_hashable, value))
+    key: Hashable = value
+    return key
 
 
 def _meaning(spec: SweepSpec, point: Mapping[str, Any]) -> str | None:

@@ -45,7 +45,7 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
             # With the values that points have of what does not act in them, or one that was tried would look new.
             point = question.parts.values_of(question.parts.point_of(point))
         # One that was tried is no look at anything new, where a space is small.
-        if all(item.point != point for item in question.known):
+        if all(item.point != point for item in question.known if item.is_own):
             with suppress(SpecError):
                 check(point)
                 return point

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 from analysis.records import ChosenPointRecord
 from analysis.wording import counted
 from policies.errors import SpecError
-from tune_jobs.search.chosen_point import checked_point, domains_text, same_point
+from tune_jobs.search.chosen_point import checked_point, domains_text, keys_of
 from tune_jobs.spec.rules import check_takes_points
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -27,19 +27,23 @@ def given_points(spec: SweepSpec) -> tuple[ChosenPointRecord, ...]:
     check_takes_points(spec)
     points: list[tuple[int, dict[str, Any]]] = []
     problems: list[str] = []
+    first: dict[Hashable, int] = {}
     for index, given in enumerate(spec.points):
         try:
             point = checked_point(spec, given, place=f"points[{index}]")
         except SpecError as error:
             problems.append(error.message)
             continue
-        twice = next((place for place, known in points if same_point(spec, known, point)), None)
+        keys = keys_of(spec, point)
+        twice = min((first[key] for key in keys if key in first), default=None)
         if twice is not None:
             problems.append(
                 f"points[{index}]: it has the values of points[{twice}]: list it once (seeds_per_point repeats points "
                 "with other seeds)"
             )
         points.append((index, point))
+        for key in keys:
+            first.setdefault(key, index)
     if problems:
         raise SpecError("\n  ".join(problems), f"The sweep searches {domains_text(spec.space)}.")
     return tuple(ChosenPointRecord(num_points=index, point=point) for index, point in points)

@@ -22,10 +22,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from analysis.objectives import env_steps_of
-from analysis.records import FINISHED, TrialRecord
+from analysis.records import FINISHED, Objective, TrialRecord
 from analysis.selection import score_trial
 from tune_jobs.search.chosen_point import outside
 from tune_jobs.spec.sweep_spec import SweepSpec
+
+TOLD: tuple[Objective, ...] = ("area", "steps_to_threshold")
+"""The objectives whose scores a search learns of; with the others it learns of the best evaluation."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class KnownPoint:
     """Whether at least one of its seeds has not ended."""
     level: int | None = None
     """The rung at which a scheduler ended it; None: none did."""
+    is_own: bool = True
+    """Whether it is one of this sweep; one of an earlier sweep tells a model as much, but was never tried in this."""
 
     @functools.cached_property
     def score(self) -> float | None:
@@ -55,10 +60,11 @@ class History:
 
     Args:
         spec: The sweep.
+        with_outside: Whether points that its search could not have given are told, too, as to another sweep's.
     """
 
-    def __init__(self, spec: SweepSpec) -> None:
-        self._spec = spec
+    def __init__(self, spec: SweepSpec, *, with_outside: bool = False) -> None:
+        self._spec, self._with_outside = spec, with_outside
         self._by_objective: bool | None = None
         self._seen: dict[int, tuple[list[TrialRecord], KnownPoint | None]] = {}
         """By point, its trials as they were when it was looked at, and what they told."""
@@ -72,7 +78,7 @@ class History:
         """
         if self._by_objective is None:
             # Decided once, for all trials: scores of two kinds can't be compared.
-            self._by_objective = _tell_scores(records)
+            self._by_objective = tell_scores(records)
             if self._by_objective:
                 self._seen.clear()  # until then the best evaluations were told
         points: defaultdict[int, list[TrialRecord]] = defaultdict(list)
@@ -88,7 +94,8 @@ class History:
         if seen is not None and len(seen[0]) == len(members) and all(map(operator.is_, seen[0], members)):
             return seen[1]
         score = _objective_score if self._by_objective else _best_evaluation
-        found = _known(self._spec, sorted(members, key=lambda record: record.index), score)
+        is_told = self._with_outside or not outside(self._spec.space, members[0].point)
+        found = _known(self._spec, sorted(members, key=lambda record: record.index), score) if is_told else None
         self._seen[index] = members, found
         return found
 
@@ -113,7 +120,7 @@ def _known(
         members: The records of its trials that have a point, in their order.
         score: Returns what one that has ended scored; None: nothing.
     """
-    if outside(spec.space, members[0].point) or all(record.status == "pending" for record in members):
+    if all(record.status == "pending" for record in members):
         return None
     ended = [record for record in members if record.status in FINISHED]
     return KnownPoint(
@@ -134,7 +141,7 @@ def _best_evaluation(record: TrialRecord) -> float | None:
     return None if scored is None else scored.score
 
 
-def _tell_scores(records: Sequence[TrialRecord]) -> bool | None:
+def tell_scores(records: Sequence[TrialRecord]) -> bool | None:
     """Return whether trials that ended with an evaluation have scores by the objective; None: none has ended so yet."""
     ended = [record for record in records if record.status in FINISHED and score_trial(record) is not None]
     return all(record.objective_score is not None for record in ended) if ended else None

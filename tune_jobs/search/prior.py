@@ -16,7 +16,7 @@ from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, Tri
 from analysis.wording import counted, is_number
 from policies.errors import SpecError, shortened
 from tune_jobs.search.chosen_point import as_written, outside
-from tune_jobs.search.history import KnownPoint, known_points
+from tune_jobs.search.history import TOLD, History, KnownPoint, tell_scores
 from tune_jobs.search.warped import rank_of, shares_of
 from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Range
@@ -34,14 +34,16 @@ def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequenc
         spec: The new sweep.
         name: The name of the earlier one.
         earlier: Its spec.
-        trials: Its trials; those that have not ended tell nothing.
+        trials: Its trials, with their scores by its objective where a search learns of these, if they are known; those
+            that have not ended tell nothing.
 
     Raises:
         SpecError: It is of another algorithm or another space, its trials changed their values, or none of its points
             could be one of the new sweep.
     """
     _check_the_same(spec, name, earlier)
-    ended = [point for point in known_points(earlier, trials) if not point.is_running]
+    # What its own search could not have given may lie in this space.
+    ended = [point for point in History(earlier, with_outside=True).known_points(trials) if not point.is_running]
     kept = []
     for known, share in zip(ended, shares_of(ended), strict=True):
         point = _seen_by(spec, earlier, known)
@@ -50,7 +52,10 @@ def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequenc
     if not kept:
         why = f"none of its {counted(len(ended), 'ended point')} lies in this space" if ended else "no point has ended"
         raise SpecError(f"prior: sweep {name} tells nothing, as {why}.", "Widen the space, or leave it out.")
-    return PriorRecord(sweep=name, env_id=earlier.env.id, points=tuple(kept), num_ended=len(ended))
+    by_best = earlier.objective.type in TOLD and tell_scores(trials) is False
+    return PriorRecord(
+        sweep=name, env_id=earlier.env.id, points=tuple(kept), num_ended=len(ended), by_best_evaluation=by_best
+    )
 
 
 def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
@@ -120,7 +125,7 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
         return [*(_like_own(item, scored) for item in earlier), *known]
     shares = iter(map(float, shares_of(ended)))
     own = [point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known]
-    return [*(KnownPoint(item.point, (item.share,)) for item in earlier), *own]
+    return [*(KnownPoint(item.point, (item.share,), is_own=False) for item in earlier), *own]
 
 
 def _like_own(item: PriorPointRecord, scored: Sequence[KnownPoint]) -> KnownPoint:
@@ -131,7 +136,7 @@ def _like_own(item: PriorPointRecord, scored: Sequence[KnownPoint]) -> KnownPoin
         scored: The own points that have a score, the worst first.
     """
     if item.share is None:
-        return KnownPoint(item.point, (None,))
+        return KnownPoint(item.point, (None,), is_own=False)
     place = item.share * (len(scored) - 1)
     worse, better = scored[math.floor(place)], scored[math.ceil(place)]
     part = place - math.floor(place)
@@ -139,7 +144,7 @@ def _like_own(item: PriorPointRecord, scored: Sequence[KnownPoint]) -> KnownPoin
     score = nearest.score
     if worse.level == better.level and worse.score is not None and better.score is not None:
         score = worse.score * (1.0 - part) + better.score * part
-    return KnownPoint(item.point, (score,), level=nearest.level)
+    return KnownPoint(item.point, (score,), level=nearest.level, is_own=False)
 
 
 def _share_of(point: KnownPoint, share: float) -> float | None:
@@ -157,4 +162,14 @@ def prior_notes(spec: SweepSpec, prior: Sequence[PriorRecord]) -> tuple[str, ...
             # The others are of values that this space doesn't have.
             what = f"{number:,} of the {all_ended:,} ended points"
         notes.append(f"The model begins with {what} of sweep {each.sweep}{other}.")
+        if each.by_best_evaluation:
+            why = "scores by its objective are not known of all its trials"
+            notes.append(f"Sweep {each.sweep} is ranked by its trials' best evaluations, as {why}.")
+    wanted = spec.search.num_startup_trials
+    most = sum(len(each.points) for each in prior) + len(spec.points) + spec.num_samples - 1
+    if prior and most < wanted:
+        notes.append(
+            f"All points will be random: with these, fewer than search.num_startup_trials ({wanted}) points will have "
+            "ended before the last begins; lower it, or raise num_samples."
+        )
     return tuple(notes)

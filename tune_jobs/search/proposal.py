@@ -10,7 +10,8 @@ of the methods, needs neither Ray nor a folder:
         known.append(KnownPoint(point, scores=(train(point, seed=0), train(point, seed=1), None)))
 
 A `KnownPoint` (`tune_jobs.search.history`) is a point, the scores of its seeds (None: that one failed), whether it
-still runs (`is_running=True`: others are proposed meanwhile) and, if it was ended early, the rung that it reached.
+still runs (`is_running=True`: others are proposed meanwhile) and, if it was ended early, the rung that it reached. One
+that somebody else tried (`is_own=False`) tells as much, and may be proposed.
 
 One more method is one more module with a function that is a `tune_jobs.search.asking.Method`, a row of `_METHODS`, and
 its name in `tune_jobs.spec.sections`.
@@ -200,7 +201,7 @@ def _new_draw(
     space: Mapping[str, Domain], known: Sequence[KnownPoint], index: int, seed: int, check: Check
 ) -> dict[str, Any]:
     """Return the random point of an index, or the next of its stream that is valid and was not tried before."""
-    tried = {meaning_of(item.point) for item in known}
+    tried = {meaning_of(item.point) for item in known if item.is_own}
 
     def check_new(point: dict[str, Any]) -> None:
         if meaning_of(point) in tried:

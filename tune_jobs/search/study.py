@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,10 +59,12 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
         )
     import optuna
 
-    storage = _storage(path)
+    if path is not None:
+        _make_file(path)
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
+        storage = None if path is None else _storage(path)
         study = optuna.create_study(study_name=name, direction="maximize", storage=storage)
         trials = [trial for trial in data.trials if trial.status in FINISHED and trial.has_point]
         parts = Parts(spec.space)
@@ -83,9 +86,7 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
     return study
 
 
-def _storage(path: Path | None) -> str | None:
-    if path is None:
-        return None
+def _make_file(path: Path) -> None:
     if path.exists():
         raise CannotRunError(
             f"{path} exists already.", "Remove it, or give another file with --out (in Python output=)."
@@ -97,7 +98,17 @@ def _storage(path: Path | None) -> str | None:
         raise CannotRunError(
             f"{path} cannot be written: {error.strerror or error}.", "Give another file, or free space on its disk."
         ) from error
-    return f"sqlite:///{path}"
+
+
+def _storage(path: Path) -> optuna.storages.RDBStorage:
+    """Return the storage in a file of any name: in a URL `?`, `%` and braces would be more than letters of it."""
+    import optuna
+
+    def connect() -> sqlite3.Connection:
+        # As SQLAlchemy connects to a file, whose pool may hand a connection to another thread.
+        return sqlite3.connect(path, check_same_thread=False)
+
+    return optuna.storages.RDBStorage("sqlite:///study.db", engine_kwargs={"creator": connect})
 
 
 def _as_optunas(

@@ -8,8 +8,9 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from policies.errors import CannotRunError
+from policies.errors import CannotRunError, SpecError
 from policies.files import absolute
+from tune_jobs.store.names import SWEEP_RECORD
 from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
 DEFAULT_STORAGE = "sweeps"
@@ -36,6 +37,24 @@ def watch_or_end(place: str | Path) -> str:
     """Return the hint of a sweep that is being run: how it is watched, and how it is ended."""
     named = name_in_commands(place)
     return f"Watch it with `tune-jobs status {named}`, or end it with `tune-jobs stop {named}`."
+
+
+def name_taken(folder: Path, *, is_sweep: bool) -> SpecError:
+    """Return the error for a new sweep in whose place there is something already.
+
+    Args:
+        folder: The place.
+        is_sweep: Whether there is a sweep; else it is what a killed process left, or a link to what isn't there.
+    """
+    if folder.is_symlink() and not is_sweep and not folder.exists():
+        return SpecError(
+            f"{folder.name!r} in {folder.parent} is a link, and what it leads to isn't there: {folder.readlink()}.",
+            "Bring that back, remove the link, or choose another name with --name.",
+        )
+    go_on = f", or continue it: `tune-jobs resume {name_in_commands(folder)}`"
+    unfinished = f"; or, if it isn't being written just now, remove that folder: it has no {SWEEP_RECORD}"
+    hint = f"Choose another name with --name{go_on if is_sweep else unfinished}."
+    return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 
 
 def still_driven(name: str) -> tuple[str, str]:

@@ -6,7 +6,8 @@ from pathlib import Path, PurePath
 
 from policies.errors import NotFoundError
 from policies.files import absolute
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores, name_taken
+from tune_jobs.store.command_names import name_taken
+from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
 
 _MAX_NAME_BYTES = 255
 
@@ -36,13 +37,15 @@ class LocalStorage:
 
     def new_sweep(self, name: str) -> SweepStore:
         """Return a new sweep of a name that seems to be free."""
+        sweep = self.sweep(name)
         if self.is_taken(name):
-            raise name_taken(self.sweep(name).folder)
-        return self.sweep(name)
+            raise name_taken(sweep.folder, is_sweep=sweep.exists())
+        return sweep
 
     def is_taken(self, name: str) -> bool:
-        """Whether a folder of this name exists."""
-        return self.sweep(name).folder.exists()
+        """Whether there is anything of this name; a link to what isn't there is in the way of a folder, too."""
+        folder = self.sweep(name).folder
+        return folder.is_symlink() or folder.exists()
 
     def sweeps(self) -> list[SweepStore]:
         """Return the sweeps in the folder, by name."""

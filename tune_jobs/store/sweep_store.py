@@ -15,11 +15,11 @@ from pathlib import Path
 
 from analysis.best_records import BestRecord, FilmsRecord
 from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
-from tune_jobs.store.command_names import name_in_commands, still_driven, watch_or_end
+from tune_jobs.store.command_names import name_in_commands, name_taken, still_driven, watch_or_end
 from tune_jobs.store.leftovers import remove_abandoned
 from tune_jobs.store.locks import held, is_held
 from tune_jobs.store.ownership import Owner
@@ -109,7 +109,7 @@ class SweepStore:
             try:
                 self.folder.mkdir()
             except FileExistsError as error:
-                raise name_taken(self.folder) from error
+                raise name_taken(self.folder, is_sweep=self.exists()) from error
             try:
                 (self.folder / names.TRIALS_FOLDER).mkdir()
             except OSError:
@@ -380,14 +380,6 @@ class SweepStore:
         """
         with held(self._driver_lock_path, *still_driven(self.name)):
             yield
-
-
-def name_taken(folder: Path) -> SpecError:
-    """Return the error for a new sweep whose folder exists already."""
-    go_on = f", or continue it: `tune-jobs resume {name_in_commands(folder)}`"
-    unfinished = f"; or, if it isn't being written just now, remove that folder: it has no {names.SWEEP_RECORD}"
-    hint = f"Choose another name with --name{go_on if SweepStore(folder).exists() else unfinished}."
-    return SpecError(f"A sweep {folder.name!r} is already in {folder.parent}.", hint)
 
 
 def list_sweep_stores(storage: Path) -> list[SweepStore]:

@@ -329,7 +329,14 @@ class Trial(Protocol):
 
     @property
     def log_path(self) -> Path:
-        """A local file that the trial's process appends its output to; readers use `log_tail`."""
+        """A local file that the trial's process appends its output to; readers use `newest_log` and `log_tail`."""
+        ...
+
+    def newest_log(self) -> Path:
+        """Return a local file with the log as it is known anywhere, to read only; without a log there is none.
+
+        Of an object store, it may be a copy, which is there as long as this trial or its sweep is kept.
+        """
         ...
 
     def write_log(self, text: str) -> None:

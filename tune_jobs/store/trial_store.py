@@ -299,6 +299,10 @@ class TrialStore(OwnedFolder):
             # The message of an env's error may contain what UTF-8 cannot encode.
             file.write(line.encode(errors="backslashreplace"))
 
+    def newest_log(self) -> Path:
+        """Return the log."""
+        return self.log_path
+
     def log_tail(self, num_lines: int = 15) -> str:
         """Return the lines that say how the trial's last process ended."""
         return log_tail(self.log_path, f"trial {self.trial_id}", num_lines)

@@ -111,7 +111,7 @@ def check_same_trials(store: Sweep, plan: SweepPlan) -> None:
             not trial.has_point
             or (
                 trial.point.get(TRAINING_LENGTH) == record.point.get(TRAINING_LENGTH)
-                and _same_values(trial.hyperparams, record.first_hyperparams, known)
+                and _same_values(trial.hyperparams, record, known)
             )
         )
         if trial is None or trial.seed != record.seed or not same:
@@ -122,11 +122,19 @@ def check_same_trials(store: Sweep, plan: SweepPlan) -> None:
             )
 
 
-def _same_values(planned: Mapping[str, Any], recorded: Mapping[str, Any], known: type[Hyperparams]) -> bool:
-    """Whether planned hyperparameters are the recorded ones; names that an older version lacked have defaults."""
-    fields = known.model_fields
-    added = {name: fields[name].default for name in planned if name in fields and name not in recorded}
-    return dict(planned) == {**added, **recorded}
+def _same_values(planned: Mapping[str, Any], record: TrialRecord, known: type[Hyperparams]) -> bool:
+    """Whether planned hyperparameters are those that a trial began with, as far as its record still has them.
+
+    Names that an older version lacked have defaults. What did not act at first and was given a value by a change of a
+    population is not looked at: the record has that value in the place of the one before.
+    """
+    began, fields = record.first_hyperparams, known.model_fields
+    added = {name: fields[name].default for name in planned if name in fields and name not in began}
+    first = record.changes[0].before if record.changes else {}
+    replaced = {name for change in record.changes for name in change.after if name not in first}
+    alike = ({**added, **began}, planned)
+    ours, theirs = ({name: each[name] for name in each if name not in replaced} for each in alike)
+    return ours == theirs
 
 
 def _add_trials(

@@ -14,9 +14,8 @@ from analysis.selection import best_checkpoint as best_of
 from policies.acting.baselines import BASELINES, ConstantPolicy
 from policies.acting.load import load_policy, policy_from_portable
 from policies.acting.policy import Policy, RandomPolicy
-from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.modules import allow_modules
-from policies.envs.wrappers import FRAME_STACK, PIXELS
+from policies.envs.wrappers import RESERVED
 from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
@@ -34,7 +33,7 @@ from tune_jobs.sweeps.drawing import ReportMatter, videos_of
 from tune_jobs.sweeps.drive import cpus_for_episodes
 from tune_jobs.sweeps.policy_choice import choose_policy, episode_of, with_runners_up
 from tune_jobs.sweeps.settings import judged
-from tune_jobs.sweeps.sources import find_sweep
+from tune_jobs.sweeps.sources import find_sweep, names_baseline
 from tune_jobs.sweeps.storage import expanded, split_trial
 from tune_jobs.training.registry import engine_of_checkpoint
 
@@ -149,7 +148,7 @@ def find_policy(
     Args:
         source: A sweep (its best; chosen now if it has not been, or was before the sweep was trained on),
             `SWEEP/TRIAL` (its best checkpoint), a checkpoint folder, a policy file, or a baseline: `random` or
-            `constant`.
+            `constant`, unless there is a sweep of that name and no `env_id`.
         storage: The folder in which sweeps are looked up by name.
         env_id: The environment it acts in; None: the one it was trained in. A baseline needs one.
         action: The action of `constant`; None: 0.
@@ -162,7 +161,7 @@ def find_policy(
             given for another policy.
     """
     text = str(source)
-    if text in BASELINES:
+    if text in BASELINES and (env_id is not None or action is not None or names_baseline(text, storage)):
         return _baseline(text, env_id, action)
     _refuse_action(text, action)
     path = expanded(text)
@@ -186,8 +185,8 @@ def find_policy(
             policy = load_policy(checkpoint)
             store = None
     if env_id is not None and env_id != policy.env_id:
-        # The constructor's arguments are those of the other environment; the wrappers of observations are the policy's.
-        wrappers = {key: value for key, value in policy.env_args.items() if key in (FRAME_STACK, PIXELS, ACTION_MASK)}
+        # The constructor's arguments are those of the other environment; the wrappers are the policy's.
+        wrappers = {key: value for key, value in policy.env_args.items() if key in RESERVED}
         return PolicySource(policy, env_id, wrappers, timeout_s=timeout_s)
     return PolicySource(policy, policy.env_id, dict(policy.env_args), store, timeout_s)
 

@@ -13,6 +13,7 @@ from rich.text import Text
 from analysis.points import searched_names, value_text
 from analysis.records import FINISHED, TrialRecord, TrialStatus
 from analysis.selection import Selection
+from analysis.tables import shown_point
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
 from tune_jobs.sweeps.columns import fit
 from tune_jobs.sweeps.monitor import Row, SweepMonitor
@@ -31,7 +32,7 @@ _MAX_POINT = 300
 
 
 def describe_point(record: TrialRecord, most: int | None = None) -> str:
-    """Describe a trial's sampled values in one line.
+    """Describe the sampled values that a trial's score was reached with in one line.
 
     Args:
         record: The trial.
@@ -40,7 +41,7 @@ def describe_point(record: TrialRecord, most: int | None = None) -> str:
     if not record.has_point:
         return "chosen at its start"
     text = ""
-    for name, value in record.point.items():
+    for name, value in shown_point(record).items():
         more = f"{text}{', ' if text else ''}{name} {short_text(value)}"
         if most is not None and len(more) > most:
             return f"{text}, ..." if text else f"{more[:most]} ..."
@@ -149,7 +150,7 @@ def _trials(monitor: SweepMonitor, rows: Sequence[Row], width: int) -> Table:
     # One width for the whole run, or columns would come and go while numbers grow.
     measured = [row.trial for row in rows]
     measured += itertools.islice(list(monitor.records.values()), _MAX_MEASURED)
-    texts = [{name: short_text(value) for name, value in trial.point.items()} for trial in measured]
+    texts = [{name: short_text(value) for name, value in shown_point(trial).items()} for trial in measured]
     names = searched_names(texts)
     names.sort(key=lambda name: len({values.get(name) for values in texts}) == 1)
     titles = ["rank", "trial", "score", "status", "env steps", *names, "training", "evaluation", "env steps/s"]
@@ -176,7 +177,7 @@ def _trials(monitor: SweepMonitor, rows: Sequence[Row], width: int) -> Table:
 def _cells(row: Row, names: Sequence[str]) -> list[str]:
     trial = row.trial
     speed = trial.num_env_steps / trial.time_s if trial.status == "running" and trial.time_s else None
-    point = trial.point if trial.has_point else {}
+    point = shown_point(trial) if trial.has_point else {}
     return [
         PLAIN_NONE if row.rank is None else str(row.rank),
         trial.trial_id,

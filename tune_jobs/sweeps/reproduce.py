@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import tempfile
 import time
@@ -18,18 +19,15 @@ from policies.arguments import checked
 from policies.envs.modules import allow_modules
 from policies.errors import CannotRunError, NotFoundError, SpecError
 from policies.guard.guard import guarding
-from policies.guard.guarded import check_env, measure_step
 from policies.hyperparams import TrainedHyperparams, make_hyperparams
 from policies.packed.sizes import group_key, is_padded_beside, may_round_by_place
 from policies.portable.file import read_policy
-from tune_jobs.plan.engine_choice import PackPlan, pack_key
-from tune_jobs.plan.machine import Machine
-from tune_jobs.plan.sweep_plan import SweepPlan
+from tune_jobs.plan.engine_choice import pack_key
 from tune_jobs.process.ran_with import versions
-from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.logs import continued_from
@@ -38,6 +36,7 @@ from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.drive import git_commit, machine_here, settled
 from tune_jobs.sweeps.outcome import Progress, SweepResult
+from tune_jobs.sweeps.repeating import plan_of_repetition
 from tune_jobs.sweeps.sources import find_source, find_trial
 from tune_jobs.sweeps.stages import run_sweep
 from tune_jobs.sweeps.storage import expanded, folder_at
@@ -60,7 +59,7 @@ def reproduce(
     It runs until the last iteration that is recorded, also where a scheduler ended the trial there; a trial that failed
     for one more. It runs on this machine, by the engine that is recorded; a member of a pack is a pack of its own, as
     its random numbers do not depend on the others (decision 10). What came after the trial had continued from a
-    checkpoint, because it was interrupted or failed, can't be repeated, and is not compared.
+    checkpoint, because it was interrupted, failed or waited for others, can't be repeated, and is not compared.
 
     Args:
         source: `SWEEP/t0003`, or the trial's folder.
@@ -96,6 +95,11 @@ def reproduce(
         _write(again, sweep, spec, trial, repeatable[-1].iteration if repeatable else 1)
         _train_again(again.place, progress)
         return _compared(store, again, trial, len(repeatable), is_kept=is_kept)
+    except BaseException:
+        # What has trained is there to be looked at; anything else would be in the way of the next try.
+        if is_kept and not _has_begun(again, trial.trial_id):
+            again.discard()
+        raise
     finally:
         if not is_kept:
             shutil.rmtree(where.parent, ignore_errors=True)
@@ -120,7 +124,7 @@ def _check(store: Sweep, trial: TrialRecord, spec: SweepSpec, recorded: Sequence
 
 def _repeatable(store: Sweep, trial: TrialRecord, recorded: Sequence[IterationRecord]) -> list[IterationRecord]:
     """Return the iterations before the trial continued from a checkpoint for the first time; mostly all."""
-    continued = continued_from(store.trial(trial.trial_id).log_path)
+    continued = continued_from(store.trial(trial.trial_id).newest_log())
     return [item for item in recorded if continued is None or item.iteration <= continued]
 
 
@@ -129,7 +133,7 @@ def _folder(output: str | Path | None, name: str) -> tuple[Path, bool]:
     if output is None:
         return Path(tempfile.mkdtemp(prefix="tune-jobs-reproduce-")) / name, False
     folder = expanded(output)
-    if folder.exists():
+    if os.path.lexists(folder):
         raise CannotRunError(f"{folder} exists already.", "Give a folder that does not exist; it is made.")
     return folder, True
 
@@ -137,16 +141,16 @@ def _folder(output: str | Path | None, name: str) -> tuple[Path, bool]:
 def _write(again: Sweep, sweep: SweepRecord, spec: SweepSpec, trial: TrialRecord, last_iteration: int) -> None:
     """Write a sweep of the one trial: nothing but its stop rules, and what ended trials, is other.
 
-    The search stays, though the point is known: what is allowed in a space depends on it.
+    The search stays, though the point is known: what is allowed in a space depends on it. So does the name in the sweep
+    file, as a folder may have names that it may not.
     """
     # One that failed did so in the iteration after the last that is recorded.
     cap = last_iteration + (trial.status == "failed")
     stop = spec.stop.model_copy(
         update={"num_iterations": min(spec.stop.num_iterations, max(1, cap)), "time_s": _LONG_S}
     )
-    changes = {
-        "stop": stop, "scheduler": SchedulerSpec(), "max_retries": 0, "name": again.name,
-    }  # fmt: skip
+    confirm = spec.confirm.model_copy(update={"max_share": 0})
+    changes = {"stop": stop, "scheduler": SchedulerSpec(), "max_retries": 0, "confirm": confirm}
     plan = TrialPlan.model_validate({name: getattr(trial, name) for name in TrialPlan.model_fields})
     again.trial(trial.trial_id).write_record(pending_record(plan))
     again.write_record(
@@ -154,10 +158,16 @@ def _write(again: Sweep, sweep: SweepRecord, spec: SweepSpec, trial: TrialRecord
             update={
                 "name": again.name, "state": "created", "spec": spec.model_copy(update=changes).model_dump(mode="json"),
                 "num_trials": 1, "created_at": time.time(), "started_at": None, "ended_at": None, "run_time_s": 0.0,
-                "versions": versions(), "git_commit": git_commit(), "address": None,
+                "versions": versions(), "git_commit": git_commit(), "address": None, "job": None,
+                "waiting": None, "replications": (), "repeats": f"{sweep.name}/{trial.trial_id}",
             }
         )
     )  # fmt: skip
+
+
+def _has_begun(again: Sweep, trial_id: str) -> bool:
+    """Return whether anything of a repetition has trained."""
+    return again.trial(trial_id).has_results() or any(known.status != "pending" for known in readable_trials(again))
 
 
 @run_alone
@@ -170,35 +180,9 @@ def _train_again(place: str, progress: str) -> SweepResult:
     spec = stored_spec(record)
     (trial,) = store.read_trials()
     machine = machine_here()
-    plan = _plan(spec, trial, record, machine)
+    plan = plan_of_repetition(spec, trial, record, machine)
     with store.lock(), settled(store):
         return run_sweep(store, plan, address=None, machine=machine, finish=False, progress=progress)
-
-
-def _plan(spec: SweepSpec, trial: TrialRecord, record: SweepRecord, machine: Machine) -> SweepPlan:
-    cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
-    if machine.fitting(cpus, gpus) < 1:
-        raise CannotRunError(
-            f"{trial.trial_id} needs {counted(cpus, 'CPU')} and {gpus:g} GPUs; {machine.source} has "
-            f"{machine.num_cpus:g} and {machine.num_gpus:g}.",
-            "Run it on a machine like the one it ran on.",
-        )
-    env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
-    env = check_env(env_id, env_args, spec.algorithm, timeout_s=timeout_s)
-    packs = None
-    if engine_named(trial.engine).trains_many:
-        from policies.packed.envs.make import choose_kind
-
-        choice = choose_kind(measure_step(env_id, env_args, timeout_s=timeout_s), spare_cpus=0)
-        packs = PackPlan(
-            num_packs=1, slots=1, cpus_per_pack=cpus, gpus_per_pack=gpus, trial_ids=(trial.trial_id,),
-            env_kind=choice.kind, env_step_us=choice.step_us, num_env_processes=0,
-        )  # fmt: skip
-    return SweepPlan(
-        trials=(trial,), num_points=1, cpus_per_trial=cpus, gpus_per_trial=gpus, max_concurrent=1,
-        max_concurrent_alone=1, evaluation_seeds=record.evaluation_seeds, confirmation_seeds=record.confirmation_seeds,
-        max_env_steps=0, max_disk_bytes=0, env=env, machine=machine, packs=packs,
-    )  # fmt: skip
 
 
 def _compared(store: Sweep, again: Sweep, trial: TrialRecord, num_repeatable: int, *, is_kept: bool) -> Repetition:
@@ -247,8 +231,8 @@ def _notes(
     notes = []
     if num_left_out:
         notes.append(
-            f"The last {counted(num_left_out, 'iteration')} can't be repeated: the trial was interrupted or failed, "
-            "and continued from its checkpoint with new episodes."
+            f"The last {counted(num_left_out, 'iteration')} can't be repeated: the trial was interrupted, failed or "
+            "waited for others, and continued from its checkpoint with new episodes."
         )
     if trial.status == "stopped":
         notes.append("A scheduler ended the trial there; the repetition ended at the same iteration.")

@@ -19,6 +19,7 @@ from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
 from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.own_job import note_own_job
+from tune_jobs.sweeps.repeating import check_takes_more, plan_of_repetition
 from tune_jobs.sweeps.stages import RACE, MoreSeeds, run_sweep
 from tune_jobs.sweeps.waiting import WaitEndedError, check_wait, machine_that_fits, note_wait
 
@@ -55,13 +56,18 @@ def go_on(
     """Run what is missing of a sweep, `num_samples` more samples of its space, and a point that somebody chose.
 
     Raises:
-        SpecError: The space has nothing to draw more samples from, or the point is wrong or known.
+        SpecError: The space has nothing to draw more samples from, the point is wrong or known, or the sweep repeats a
+            trial of another one.
         CannotRunError: Another process runs the sweep, or it cannot run here.
     """
     more = bool(num_samples) or point is not None or retry_failed
     with _taken_over(store, address, wait_for_nodes, progress, more=more) as (machine, where, notes):
         record = store.read_record()
         spec = stored_spec(record)
+        if record.repeats is not None:
+            (trial,) = store.read_trials()
+            plan = plan_of_repetition(spec, trial, record, where).with_notes(notes)
+            return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
         if num_samples:
             check_extendable(spec, num_samples)
         spec = spec.model_copy(update={"num_samples": spec.num_samples + num_samples})
@@ -120,6 +126,8 @@ def _taken_over(
         store.clear_stop_request()
         stack.enter_context(settled(store))
         note_own_job(store)
+        if more:
+            check_takes_more(store.read_record())
         allow_modules(store.read_record().allowed_modules)
         machine = machine_here() if address is None else None
         if machine is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from analysis.records import TrialRecord
 from policies.errors import NotFoundError
+from policies.portable.file import BASELINE_KINDS
 from policies.suggestions import did_you_mean
 from tune_jobs.store.candidates import read_trials
 from tune_jobs.store.command_names import name_in_commands
@@ -44,6 +45,17 @@ def find_sweep(sweep: str | Path, storage: str | Path | None = None) -> Sweep:
         f"No sweep {str(sweep)!r} in {root}.{did_you_mean(sweep, known)}",
         "List the sweeps with `tune-jobs list`; name another storage with --storage.",
     )
+
+
+def names_baseline(source: str, storage: str | Path | None = None) -> bool:
+    """Whether a text without an environment names a baseline policy: former versions let sweeps be called so."""
+    if source not in BASELINE_KINDS:
+        return False
+    try:
+        find_sweep(source, storage)
+    except NotFoundError:
+        return True
+    return False
 
 
 def find_source(source: str | Path, storage: str | Path | None = None) -> tuple[Sweep, str | None]:

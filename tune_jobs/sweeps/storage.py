@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl, quote, urlencode
 
 from policies.errors import SpecError
 from policies.files import absolute
-from tune_jobs.spec.sweep_spec import check_sweep_name
+from tune_jobs.spec.sweep_spec import check_sweep_name, name_after
 from tune_jobs.store.command_names import DEFAULT_STORAGE
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import is_url, open_storage
@@ -175,6 +175,7 @@ def choose_store(name: str | None, stem: str, storage: str | Path) -> Sweep:
     kept = open_storage(storage)
     if name is not None:
         return kept.new_sweep(check_sweep_name(name))
+    stem = name_after(stem)
     # Only the creation of the folder decides whether a name is free; this finds one that is likely free.
     number = 1
     while True:

@@ -26,6 +26,7 @@ from tune_jobs.store.opening import is_url
 from tune_jobs.sweeps.current_best import has_best_to_show
 from tune_jobs.sweeps.curves import Columns, Curve
 from tune_jobs.sweeps.gathered import spec_of, sweep_data
+from tune_jobs.sweeps.numbered_nodes import NumberedNodes
 from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.shortened_paths import Shortener
 from tune_jobs.sweeps.status import SweepStatus, status_of
@@ -41,7 +42,7 @@ _MAX_POINTS = 200_000
 """Points of all curves together."""
 _MOST_OF_ONE, _LEAST_OF_ONE = 1_000, 20
 # Where it ran, and what it needs of its machine, concerns nobody elsewhere.
-_NOT_OF_SWEEPS = ("format_version", "address", "allowed_modules", "state")
+_NOT_OF_SWEEPS = ("format_version", "address", "job", "allowed_modules", "waiting", "state")
 _NOT_OF_TRIALS = ("ran_with",)
 
 
@@ -104,12 +105,16 @@ def _without(record: SweepRecord | TrialRecord, names: Sequence[str]) -> dict[st
 
 
 def _rows(trials: Sequence[TrialRecord]) -> list[dict[str, Any]]:
-    nodes: dict[str, str] = {}
+    nodes = NumberedNodes(trials)
     rows = []
     for trial in trials:
         scored = score_trial(trial)
-        node = None if trial.node is None else nodes.setdefault(trial.node, f"node {len(nodes) + 1}")
-        more = {"node": node, "score": None if scored is None else to_json(scored.score)}
+        more = {
+            "node": None if trial.node is None else nodes.named(trial.node),
+            "notes": [nodes.in_text(note) for note in trial.notes],
+            "error": None if trial.error is None else nodes.in_text(trial.error),
+            "score": None if scored is None else to_json(scored.score),
+        }
         rows.append(_without(trial, _NOT_OF_TRIALS) | more)
     return rows
 

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any
 
 from policies.acting.evaluate import Episodes, Evaluator
@@ -22,6 +23,7 @@ from policies.acting.policy import Policy
 from policies.envs.tallies import Reached, evaluating, tally_of
 from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
 from tune_jobs.store.contract import Ownership
+from tune_jobs.store.logs import built_from
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.progress import Progress
@@ -212,6 +214,7 @@ class PackLoop:
             if not trained:
                 return False
             results = self._engine.train_iteration({member.task.trial_id for member in self._all if member.waits})
+            self._note_moved()
             evaluations: dict[TrialInPack, Episodes | Exception | None] = {}
             for member in trained:
                 stats = results[member.task.trial_id]
@@ -227,6 +230,14 @@ class PackLoop:
                     evaluations.update(zip(due, self._evaluate(self._evaluator, policies), strict=True))
             self._conclude(evaluations)
         return bool(due)
+
+    def _note_moved(self) -> None:
+        """Write to the logs of members that wait which of them will go on in new episodes, as from a checkpoint."""
+        acts = {}
+        for member in map(self._members.__getitem__, self._engine.moved):
+            line = built_from(member.task.seed, Path(f"{member.trial.iteration:06d}"))
+            acts[member] = functools.partial(_log, member.task, line)
+        self._attempt(acts, saves=False)
 
     @property
     def _all(self) -> list[TrialInPack]:

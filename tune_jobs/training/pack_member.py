@@ -92,6 +92,9 @@ class TrialInPack:
         """Let it wait from so many env steps on, or go on if it waits at fewer; None: it never waits."""
         self.hold_at = hold_at
         if self.loop is not None:
+            if self.loop.waits:
+                # Those that gave their place away don't count their wait either.
+                self.loop.restart_clock()
             self.loop.hold_at = hold_at
 
     @property

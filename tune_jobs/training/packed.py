@@ -56,6 +56,8 @@ class PackedEngine:
         self._before: dict[str, tuple[int, int]] = {}
         """Env steps and iterations of a trial that its member does not count; negative if it counts another's."""
         self._num_stacks = itertools.count()
+        self.moved: Collection[str] = ()
+        """The members that the last iteration moved to another stack."""
 
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Add a trial, fresh or exactly as a checkpoint folder holds it."""
@@ -127,6 +129,7 @@ class PackedEngine:
     def train_iteration(self, held: Collection[str] = ()) -> dict[str, IterationStats | Exception]:
         """Train every member for one iteration, but those that are held; the stacks take turns."""
         results: dict[str, IterationStats | Exception] = {}
+        self.moved = ()
         stacks = self._apart(held) if held else list(self._stacks.values())
         for stack in stacks:
             stack.begin_iteration()
@@ -161,6 +164,7 @@ class PackedEngine:
                 )
             self._stacks[new].add(member, random_streams.member_env_seed_after(task.seed, self._done(member)[1]))
             self._tasks[trial_id] = (task, new)
+        self.moved = (*self.moved, *trial_ids)
 
     def policy(self, trial_id: str) -> PortablePolicy:
         """Return the current greedy policy of a member."""

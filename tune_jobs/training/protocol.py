@@ -115,6 +115,11 @@ class TrainingEngine(TrialEngine, Protocol):
 class PackEngine(Protocol):
     """Trains many trials together, the members of a pack, which can be added and removed."""
 
+    @property
+    def moved(self) -> Collection[str]:
+        """The held members that can't go on as they were after the last iteration, but in new episodes."""
+        ...
+
     def add(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Add a trial, fresh or exactly as a checkpoint folder holds it, without any effect on other members.
 

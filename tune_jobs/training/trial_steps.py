@@ -100,6 +100,10 @@ class TrialSteps:
         reached = self.hold_at is not None and self._evaluated_at == self._last.num_env_steps >= self.hold_at
         return reached and not self._is_copy
 
+    def restart_clock(self) -> None:
+        """Count its seconds of training on from its last iteration; what came since then was none of it."""
+        self._started = self._clock() - self._last.time_s
+
     def where(self) -> Progress:
         """Return where a trial stands that was opened where it waits."""
         return self._progress("running", evaluated=True)
@@ -170,7 +174,7 @@ class TrialSteps:
         done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
         self._engine.build(done, folder)
         self._store.write_log(built_from(self.task.seed, folder))
-        self._started = self._clock() - self._last.time_s
+        self.restart_clock()
         self._started_at = time.time()
 
     def _take_up_results(self, start: CheckpointRecord | None) -> None:
@@ -212,14 +216,8 @@ class TrialSteps:
         if contradicts or self._last.iteration < iteration:
             # The checkpoint's own line could not be read or contradicts it; the checkpoint's numbers are right.
             # The curve has a gap there; the counts continue.
-            self._last = self._last.model_copy(
-                update={
-                    "iteration": start.iteration,
-                    "num_env_steps": start.num_env_steps,
-                    "training_return": start.training_return,
-                    "evaluation_return": start.evaluation_return,
-                }
-            )
+            known = ("iteration", "num_env_steps", "training_return", "evaluation_return")
+            self._last = self._last.model_copy(update={name: getattr(start, name) for name in known})
             if start.evaluation_return is not None:
                 self._evaluation_return = start.evaluation_return
                 self._evaluated_at = start.num_env_steps

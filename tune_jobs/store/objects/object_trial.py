@@ -335,9 +335,13 @@ class ObjectTrial:
             with contextlib.suppress(TuneJobsError):
                 outbox().add(("log", self._log_key, id(self)), LogUploads(self._parts, self._log_key, path).bring)
 
+    def newest_log(self) -> Path:
+        """Return this machine's file, or a copy of the store's if that is newer."""
+        return self._parts.newest_log(self._log_key, self.log_path)
+
     def log_tail(self, num_lines: int = 15) -> str:
         """Return the lines that say how the trial's last process ended."""
-        return log_tail(self._parts.newest_log(self._log_key, self.log_path), f"trial {self.trial_id}", num_lines)
+        return log_tail(self.newest_log(), f"trial {self.trial_id}", num_lines)
 
     @property
     def _log_key(self) -> str:
