@@ -105,8 +105,8 @@ def test_a_file_has_one_lock_by_whatever_name(tmp_path: Path) -> None:
 
 def test_a_lock_that_can_not_be_written_is_told(tmp_path: Path) -> None:
     engine = open_database(sqlite_url(tmp_path / "service.db"))
-    (tmp_path / "service.db.lock").mkdir()
-    with pytest.raises(CannotRunError, match=r"can't write .*service\.db\.lock: Is a directory\."), held(engine):
+    (tmp_path / "service.db.held").mkdir()
+    with pytest.raises(CannotRunError, match=r"can't write .*service\.db\.held: Is a directory\."), held(engine):
         pass
     engine.dispose()
 

@@ -113,7 +113,7 @@ def _file_held(engine: Engine) -> Iterator[None]:
         yield
         return
     # However the file is named, it has one lock; not the file itself, which SQLite locks in its own way.
-    lock = f"{Path(str(file)).resolve()}.lock"
+    lock = f"{Path(str(file)).resolve()}.held"
     try:
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
