@@ -108,6 +108,9 @@ class IterationRecord(Record):
     num_env_steps: Count = Field(description="Env steps sampled so far in this trial.")
     num_episodes: Count = Field(description="Whole episodes so far in this trial.")
     time_s: Number = Field(description="Seconds of training so far, evaluation and checkpoints included.")
+    waited_s: Number = Field(
+        0.0, description="The seconds of these in which it waited for others in its pack, before this iteration."
+    )
     training_return: float | None = None
     evaluation_return: float | None = Field(None, description="None: not evaluated at this iteration.")
     episode_returns: tuple[Number, ...] = Field((), description="Whole training episodes that ended here.")

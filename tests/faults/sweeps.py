@@ -28,6 +28,7 @@ EVERY_ITERATIONS, NUM_ENV_STEPS, PACE_S = 3, 6_400, 0.004
 LIMIT_S = 900.0
 _STARTUP = 4
 """Points that TPE draws before it chooses by results."""
+_TIMES = {"time_s", "waited_s"}
 
 
 def spec(kind: str, folder: Path, *, pace_s: float = PACE_S, **changes: Any) -> dict[str, Any]:
@@ -247,7 +248,7 @@ def _differences(sweep: Sweep, reference: Sweep, name: str, *, whole: bool) -> l
     ours, theirs = ([json.loads(line) for line in which.lines(name)] for which in (sweep, reference))
     ours = [line for line in ours if limit is None or line["iteration"] <= limit]
     for mine, other in zip(ours, theirs, strict=False):
-        keys = [key for key in mine.keys() | other.keys() if key != "time_s" and mine.get(key) != other.get(key)]
+        keys = [key for key in (mine.keys() | other.keys()) - _TIMES if mine.get(key) != other.get(key)]
         if keys:
             return [f"{name} differs in {sorted(keys)} at iteration {mine['iteration']} from an undisturbed one"]
     if limit is not None:

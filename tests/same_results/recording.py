@@ -29,7 +29,7 @@ import yaml
 from tests.same_results.program import Program
 from tests.same_results.sweeps import Sweep
 
-_VOLATILE = frozenset({"time", "time_s", "started_at", "ended_at", "node", "pid", "ran_with"})
+_VOLATILE = frozenset({"time", "time_s", "waited_s", "started_at", "ended_at", "node", "pid", "ran_with"})
 """Fields of records that say when, how long and where."""
 _HASHED = ("policy.safetensors", "policy.json", "state.safetensors", "state.json")
 _NUM_CONFIRMATIONS = 10

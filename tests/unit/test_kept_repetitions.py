@@ -1,19 +1,26 @@
 """The folder that a repetition is kept in: which names it may have, and when it is left there."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from sweep_folders import make_sweep_folder, train
 
 import tune_jobs
-from analysis.records import JobRecord
+from analysis.records import JobRecord, ReplicationRecord, TrialPlan
 from analysis.waits import WaitRecord
 from policies.errors import CannotRunError, SpecError
+from tests.narrowing import present
+from tune_jobs.plan.machine import Machine
 from tune_jobs.spec.file import stored_spec
+from tune_jobs.store import candidates
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps import reproduce as module
+from tune_jobs.sweeps import resume
 from tune_jobs.sweeps.interrupted import SweepInterrupted
+from tune_jobs.sweeps.outcome import SweepResult
 
 
 @pytest.fixture
@@ -108,3 +115,44 @@ def test_more_trials_for_a_repetition_are_refused(store: SweepStore, again: Agai
             call()
         assert "Add them to sweep mine" in caught.value.hint
     assert [trial.trial_id for trial in tune_jobs.trials(out)] == ["t0001"]
+
+
+def test_a_repetition_says_which_cluster_it_runs_on(
+    store: SweepStore, again: Again, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "again"
+    tune_jobs.reproduce("mine/t0001", storage=tmp_path, output=out)
+    (trial,) = SweepStore(out).read_trials()
+    made, runs_on = SweepStore(out), []
+
+    def run(kept: SweepStore, _: object, **where: object) -> SweepResult:
+        runs_on.append((where["address"], kept.read_record().address))
+        return SweepResult(kept.place, kept.read_record(), kept.read_trials())
+
+    @contextlib.contextmanager
+    def taken(*_: object, **__: object) -> Iterator[tuple[None, Machine, tuple[str, ...]]]:
+        yield None, Machine(8.0), ()
+
+    monkeypatch.setattr(resume, "run_sweep", run)
+    monkeypatch.setattr(resume, "_taken_over", taken)
+    for status in ("paused", "completed"):
+        made.trial("t0001").write_record(trial.model_copy(update={"status": status}))
+        for address in ("ray://head:10001", None):
+            resume.go_on(made, address, finish=False, progress="none")
+    # Nothing is written of what is finished.
+    assert runs_on == [("ray://head:10001", "ray://head:10001"), (None, None), ("ray://head:10001", None), (None, None)]
+
+
+def test_a_repetition_of_an_extra_seed_is_numbered_as_the_original(tmp_path: Path, again: Again) -> None:
+    store = make_sweep_folder(tmp_path / "mine")
+    record = store.read_record()
+    more = ReplicationRecord(num_points=2, points=(0,))
+    store.write_record(record.model_copy(update={"num_trials": 5, "replications": (more,)}))
+    extra = {"trial_id": "t0004", "index": 4, "point_index": 0, "seed_index": 2, "seed": 77}
+    plan = {name: getattr(store.read_trials()[0], name) for name in TrialPlan.model_fields}
+    store.trial("t0004").write_record(pending_record(TrialPlan.model_validate(plan | extra)))
+    train(store, "t0004", 6)
+    assert candidates.read_trials(store)[-1].seed_index == 2
+    found = tune_jobs.reproduce("mine/t0004", storage=tmp_path, output=tmp_path / "again")
+    (repeated,) = candidates.read_trials(SweepStore(present(found.folder)))
+    assert {name: getattr(repeated, name) for name in extra} == extra

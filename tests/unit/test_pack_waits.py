@@ -1,4 +1,4 @@
-"""What a member of a pack has of its wait for others: no seconds of training, and what its log says of new episodes."""
+"""What a member of a pack has of its wait for others: none of the seconds that `stop` limits, and what its log says of new episodes."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -39,6 +39,7 @@ def test_what_a_member_waits_is_no_training(tmp_path: Path) -> None:
     pack.loop.hold({"t0000": 200})
     pack.advance()
     assert (pack.of("t0000")[-1].waits, pack.last("t0000").time_s) == (True, 20.0)
+    waited = 3 * 3_600.0
     for _ in range(3):
         # Others train, in another pack or in this one's place.
         clock.now += 3_600.0
@@ -46,21 +47,24 @@ def test_what_a_member_waits_is_no_training(tmp_path: Path) -> None:
         pack.advance()
     pack.loop.hold({"t0000": 400})
     pack.advance()
-    assert (pack.last("t0000").status, pack.last("t0000").time_s) == ("running", 30.0)
+    assert (pack.last("t0000").status, pack.last("t0000").time_s) == ("running", 30.0 + waited)
     clock.now += 1.0
     pack.loop.hold({"t0000": 400})
     pack.advance()
     # Not only that it trains counts, but all that comes between its iterations while it does.
-    assert pack.last("t0000").time_s == 41.0
+    assert pack.last("t0000").time_s == 41.0 + waited
     clock.now += 3_600.0
     pack.loop.hold({})
     pack.run()
     ended = pack.last("t0000")
-    assert (ended.status, ended.stop_reason, ended.time_s) == ("completed", "num_iterations 5 >= 5", 51.0)
-    assert [record.time_s for record in pack.store("t0000").read_iterations()] == [10.0, 20.0, 30.0, 41.0, 51.0]
+    assert (ended.status, ended.stop_reason, ended.time_s) == ("completed", "num_iterations 5 >= 5", 3_651.0 + waited)
+    records = pack.store("t0000").read_iterations()
+    # What the processors are shared by knows the pack's seconds, the stop rule those without its waits.
+    assert [record.waited_s for record in records] == [0.0, 0.0, waited, waited, waited + 3_600]
+    assert [record.time_s - record.waited_s for record in records] == [10.0, 20.0, 30.0, 41.0, 51.0]
 
 
-def test_a_member_that_waits_beside_one_that_trains_does_not_count_its_seconds(tmp_path: Path) -> None:
+def test_the_seconds_of_one_that_trains_beside_it_are_a_wait(tmp_path: Path) -> None:
     clock = FakeClock()
     pack = Pack(tmp_path, lambda _: Slow(clock), clock=clock).add("t0000", "t0001")
     pack.loop.hold({"t0000": 100})
@@ -69,7 +73,26 @@ def test_a_member_that_waits_beside_one_that_trains_does_not_count_its_seconds(t
     pack.loop.hold({})
     pack.advance()
     # In the first iteration and the last both train.
-    assert [pack.last(trial_id).time_s for trial_id in ("t0000", "t0001")] == [40.0, 70.0]
+    assert [pack.last(trial_id).time_s for trial_id in ("t0000", "t0001")] == [70.0, 70.0]
+    assert [pack.store(trial_id).read_iterations()[-1].waited_s for trial_id in ("t0000", "t0001")] == [30.0, 0.0]
+
+
+def test_a_wait_is_none_of_its_seconds_after_a_restore(tmp_path: Path) -> None:
+    clock = FakeClock()
+    pack = Pack(tmp_path, lambda _: Slow(clock), clock=clock, stop={"num_iterations": 9, "time_s": 45})
+    pack.add("t0000").advance()
+    pack.loop.hold({"t0000": 100})
+    pack.advance()
+    clock.now += 3_600.0
+    pack.loop.hold({})
+    pack.advance()
+    pack.stop = True
+    pack.advance()
+    assert pack.last("t0000").status == "paused"
+    again = Pack(tmp_path, lambda _: Slow(clock), clock=clock, stop={"num_iterations": 9, "time_s": 45})
+    again.add("t0000").run()
+    assert again.last("t0000").stop_reason == "time_s 50 >= 45"
+    assert [record.waited_s for record in again.store("t0000").read_iterations()] == [0.0, *[3_600.0] * 4]
 
 
 # -- its episodes
@@ -108,7 +131,9 @@ class RealPack:
         return TrialStore(self.folder, trial_id)
 
     def episodes(self, trial_id: str) -> list[IterationRecord]:
-        return [item.model_copy(update={"time_s": 0.0}) for item in self.store(trial_id).read_iterations()]
+        return [
+            item.model_copy(update={"time_s": 0.0, "waited_s": 0.0}) for item in self.store(trial_id).read_iterations()
+        ]
 
 
 @pytest.fixture(params=SIZES)

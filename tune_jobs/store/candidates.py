@@ -103,8 +103,8 @@ def _warn(message: str) -> None:
 def _place_of(record: TrialRecord, sweep: SweepRecord) -> dict[str, int]:
     """Return a trial's index, and the indices of its point and seed, as the plan numbers them."""
     seeds = sweep.spec.get("seeds_per_point")
-    if type(seeds) is not int or seeds < 1:
-        return {}
+    if type(seeds) is not int or seeds < 1 or sweep.repeats is not None:
+        return {}  # a repetition has its one trial as another sweep numbers it
     index = int(record.trial_id[1:])
     try:
         return {"index": index, **place_of(index, seeds, sweep.replications)._asdict()}

@@ -24,7 +24,7 @@ class Forecast:
     max_env_steps: int
     """The most that there will be: of a trial that ended what it took, of another one its cap."""
     env_steps_per_s: float | None
-    """Of the running trials together, while they trained; None: they have not reported any, or none runs."""
+    """Of the running trials together, since each of them began; None: they have not reported any, or none runs."""
     time_left_s: float | None
     """Seconds until all trials have ended, if those that have not take as many env steps as those that have."""
 

@@ -67,6 +67,9 @@ def go_on(
         if record.repeats is not None:
             (trial,) = store.read_trials()
             plan = plan_of_repetition(spec, trial, record, where).with_notes(notes)
+            if trial.status not in FINISHED:
+                # As where trials are added: who goes on with it knows where it runs.
+                store.write_record(record.model_copy(update={"address": address, "state": "running"}))
             return run_sweep(store, plan, address=address, machine=machine, finish=finish, progress=progress)
         if num_samples:
             check_extendable(spec, num_samples)

@@ -93,8 +93,7 @@ class TrialInPack:
         self.hold_at = hold_at
         if self.loop is not None:
             if self.loop.waits:
-                # Those that gave their place away don't count their wait either.
-                self.loop.restart_clock()
+                self.loop.note_wait()
             self.loop.hold_at = hold_at
 
     @property

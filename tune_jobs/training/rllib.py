@@ -19,6 +19,7 @@ from policies.rllib.config import build_algorithm_config
 from policies.rllib.dqn_algorithm import ReplayDQN
 from policies.rllib.env_runner import ArrayEnvRunner
 from policies.rllib.restore import portable_policy, restore_algorithm, take_over_state
+from policies.rllib.runner_errors import as_raised_there
 from tune_jobs.training.devices import device_for
 from tune_jobs.training.env_runner import EnvRunner
 from tune_jobs.training.protocol import IterationStats, TrialTask
@@ -66,6 +67,7 @@ class RLlibEngine:
             raise RuntimeError("build() has not been called")
         return self._algorithm
 
+    @as_raised_there()
     def build(self, task: TrialTask, checkpoint: Path | None) -> None:
         """Make the Algorithm of a trial, fresh or exactly as a checkpoint folder holds it."""
         self.close()
@@ -136,10 +138,12 @@ class RLlibEngine:
             if self._hyperparams.replay != "none" and self.algorithm.num_updates:
                 self.algorithm.refill(num_steps)
 
+    @as_raised_there()
     def train_iteration(self) -> IterationStats:
         """Train for one iteration.
 
         Raises:
+            Exception: What an env runner raised, in whichever process.
             CannotRunError: An env runner died; RLlib would continue with fewer, or with none and without learning.
         """
         result = self.algorithm.train()

@@ -30,8 +30,9 @@ def stop_reason(
     for name, (count, cap) in caps.items():
         if cap is not None and count >= cap:
             return f"{name} {count} >= {cap}"
-    if record.time_s >= stop.time_s:
-        return f"time_s {record.time_s:.0f} >= {stop.time_s:g}"
+    # A wait for others is no training of its own; a trial that gave its place away does not count it at all.
+    if (trained_s := record.time_s - record.waited_s) >= stop.time_s:
+        return f"time_s {trained_s:.0f} >= {stop.time_s:g}"
     return None
 
 

@@ -83,7 +83,7 @@ class TrialSteps:
         self._is_copy = False
         # The folder with the weights that the trial goes on from; None: it is built from its seed.
         self._built_from: Path | None = None
-        self._started = 0.0
+        self._started = self._waited_s = 0.0
         self._started_at: float | None = None
         self._evaluated_at = -1
         self.hold_at: int | None = None
@@ -100,9 +100,9 @@ class TrialSteps:
         reached = self.hold_at is not None and self._evaluated_at == self._last.num_env_steps >= self.hold_at
         return reached and not self._is_copy
 
-    def restart_clock(self) -> None:
-        """Count its seconds of training on from its last iteration; what came since then was none of it."""
-        self._started = self._clock() - self._last.time_s
+    def note_wait(self) -> None:
+        """Count what has come since its last iteration as a wait for others, not as training."""
+        self._waited_s = self._last.waited_s + self._clock() - self._started - self._last.time_s
 
     def where(self) -> Progress:
         """Return where a trial stands that was opened where it waits."""
@@ -174,7 +174,7 @@ class TrialSteps:
         done = replace(self.task, num_env_steps=self._last.num_env_steps, num_iterations=self._last.iteration)
         self._engine.build(done, folder)
         self._store.write_log(built_from(self.task.seed, folder))
-        self.restart_clock()
+        self._started, self._waited_s = self._clock() - self._last.time_s, self._last.waited_s
         self._started_at = time.time()
 
     def _take_up_results(self, start: CheckpointRecord | None) -> None:
@@ -188,7 +188,7 @@ class TrialSteps:
         changed_at = max((change.iteration for change in self.task.changes if change.iteration <= iteration), default=0)
         kept = [record for record in found.records if record.iteration <= iteration]
         self._score.begin(kept)
-        time_s = 0.0
+        time_s = waited_s = 0.0
         if self._store.has_results():
             self._store.keep_iterations(kept)
         for record in kept:
@@ -200,8 +200,9 @@ class TrialSteps:
             self._last = record
             # With an invalid time, the stop rule `time_s` would never end the trial, or end it at once.
             if 0 <= record.time_s < math.inf:
-                time_s = record.time_s
-        self._last = self._last.model_copy(update={"time_s": time_s})
+                time_s, waited_s = record.time_s, record.waited_s
+        waited_s = waited_s if 0 <= waited_s <= time_s else 0.0
+        self._last = self._last.model_copy(update={"time_s": time_s, "waited_s": waited_s})
         if start is None:
             return
         contradicts = (
@@ -317,6 +318,7 @@ class TrialSteps:
             num_env_steps=stats.num_env_steps,
             num_episodes=self._last.num_episodes + len(returns),
             time_s=self._clock() - self._started,
+            waited_s=self._waited_s,
             training_return=sum(self._window) / len(self._window) if self._window else None,
             episode_returns=returns,
             episode_lengths=tuple(length for _, length in stats.episodes),
