@@ -254,11 +254,13 @@ def _made(
     if wrappers.atari is not None:
         kwargs = wrappers.atari.game_args(env_id, creator, kwargs)
     entry: Any = partial(InOwnProcess, env_id) if wrappers.own_process else creator
-    if _LIMIT in kwargs and _LIMIT in named_parameters(creator):
-        # Gymnasium's functions take it for themselves, also from what the env is registered with where they make many.
-        limit = {_LIMIT: kwargs[_LIMIT]}
-        spec = replace(spec, kwargs={**spec.kwargs, **limit})
-        entry = partial(entry, **limit)
+    # Gymnasium's functions take it for themselves, also from what the env is registered with where they make many.
+    given = {**spec.kwargs, **kwargs} if _LIMIT in named_parameters(creator) else spec.kwargs
+    if creator is not None and _LIMIT in given:
+        spec = replace(spec, kwargs={name: value for name, value in spec.kwargs.items() if name != _LIMIT})
+        entry = partial(entry, max_episode_steps=given[_LIMIT])
+        if hasattr(creator, "metadata"):  # by which gym.make knows for whom it opens a window
+            vars(entry)["metadata"] = creator.metadata
     made = replace(spec, entry_point=entry) if isinstance(entry, partial) else spec
     return without_window(partial(make, made), kwargs, creator, spec.kwargs)
 

@@ -78,21 +78,25 @@ class Numbers(gym.spaces.Box):
         original: The environment's own space.
 
     Attributes:
-        original: The same.
+        original: A copy of it, whose whole numbers have the bounds of `is_bounded`.
 
     Raises:
         UnsupportedActionsError: A member of the space is no Box, or there are no numbers or too many.
     """
 
     def __init__(self, original: gym.Space[Any]) -> None:
-        self.original = original
-        boxes = [space for _, space in leaves(original, ())]
+        self.original = copy.deepcopy(original)
+        boxes = [space for _, space in leaves(self.original, ())]
         self._boxes = [space for space in boxes if isinstance(space, gym.spaces.Box)]
         sizes = [math.prod(space.shape) for space in self._boxes]
         if len(boxes) != len(sizes):
             raise UnsupportedActionsError(f"{shortened(original)}, which are not only numbers")
         _check_total(sum(sizes), original)
-        self._has_whole = any(not np.issubdtype(space.dtype, np.floating) for space in self._boxes)
+        whole = [space for space in self._boxes if not np.issubdtype(space.dtype, np.floating)]
+        self._has_whole = bool(whole)
+        for space in whole:
+            # A Box draws by these, and can't between written-out bounds that are the largest of their type.
+            space.bounded_below, space.bounded_above = is_bounded(space)
         floats = [space.dtype for space in self._boxes if np.issubdtype(space.dtype, np.floating)]
         dtype = np.result_type(np.float32, *floats)
         with np.errstate(over="ignore"):
@@ -230,12 +234,13 @@ def own_actions(space: gym.Space[Any], actions: NDArray[Any]) -> Any:
 def is_bounded(space: gym.spaces.Box) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return where a Box has lower bounds, and where upper ones, by their values, which are all that files have.
 
-    Gymnasium writes infinite bounds of whole numbers as the least and the largest that their type holds. Of few bits
-    those are taken for bounds, as of bytes, and so are those of numbers without a sign, which it lets nobody leave out.
+    Gymnasium writes infinite bounds of whole numbers as the least and the largest that their type holds, asks whoever
+    writes them for one less, and draws nothing beyond two less. Of few bits those are taken for bounds, as of bytes,
+    and so are those of numbers without a sign, which it lets nobody leave out.
     """
     if space.dtype in (np.int32, np.int64):
         most = np.iinfo(space.dtype)
-        return space.low > most.min, space.high < most.max
+        return space.low > most.min + 2, space.high < most.max - 2
     return space.low > -np.inf, space.high < np.inf
 
 

@@ -29,10 +29,15 @@ _CHOOSES_WHEN_IMPORTED = "dm_control"
 """A package that draws with MuJoCo's backends, by the variable's value when it is imported."""
 _DISPLAY = re.compile("(?i:display)(?![_a-z])")
 """In the name or the words of an error; no part of another word, as in display_mode."""
-_GRAPHICS = re.compile("(?i:opengl|(?<![a-z])egl|osmesa|glx|glfw|vulkan|libgl|video device|pip install)")
+_GRAPHICS = re.compile(
+    "(?i:opengl|(?<![a-z])egl|osmesa|glx|glfw|vulkan|libgl|gladload|framebuffer is not|video device"
+    "|(?:x11|wayland|kmsdrm) not available|pip install)"
+)
 """In the words of an error of what draws, or of what is missing to draw with."""
 _GRAPHICS_PACKAGES = frozenset({"OpenGL", "dm_control", "glfw", "mujoco", "pygame", "pyglet"})
 """Which raise errors that say nothing of it, such as that None has no attribute."""
+_SAYS_WHO_ERRED = "pygame"
+"""The one of them whose own class of errors is also that of what its caller did wrong, as to draw without a font."""
 _TRIAL_TIMEOUT_S = 30.0
 
 
@@ -113,6 +118,8 @@ def drawing_hint(error: BaseException) -> str:
         str(frame.f_globals.get("__name__", "")).partition(".")[0]
         for frame, _ in traceback.walk_tb(error.__traceback__)
     }
+    # What is raised in C leaves no frame of its package.
+    by |= {type(error).__module__.partition(".")[0]} - {_SAYS_WHO_ERRED}
     told = f"{type(error).__name__} {said_by(error)}"
     if isinstance(error, ImportError) or by & _GRAPHICS_PACKAGES or _GRAPHICS.search(told):
         return (

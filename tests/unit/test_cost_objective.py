@@ -84,7 +84,8 @@ def test_no_cost_is_noted_in_which_trainings_differ_by_another_end_than_a_goal()
             load_spec({**SWEEP, "algorithm": algorithm, "objective": ["return", "env_steps"], **fields})
         )
 
-    assert notes(stop={"num_episodes": 100}) == []
+    assert notes(stop={"num_episodes": 100}) == notes(stop={"time_s": 60}) == []
+    assert notes(stop={"time_s": 3600})
     sizes, steps = {"train_batch_size": {"choice": [512, 1024]}}, {"env_steps_per_iteration": {"choice": [500, 1000]}}
     assert (
         notes(space=sizes, stop={"num_iterations": 20}) == notes("dqn", space=steps, stop={"num_iterations": 20}) == []

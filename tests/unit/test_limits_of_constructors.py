@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import HumanRendering, TimeLimit
 from policy_factory import registered
 
 from policies.envs.make import check_env, make_env, make_vector_env
@@ -42,6 +42,23 @@ class Required(Limited):
     def __init__(self, max_episode_steps: int, size: int = 1) -> None:
         super().__init__(max_episode_steps)
         self.size = size
+
+
+class HandsOn(Limited):
+    """Hands on what it is given, as to the class that it is derived from."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**given)
+
+
+class Drawn(Limited):
+    """Opens no window itself."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(self, max_episode_steps: int = 3, render_mode: str | None = None) -> None:
+        super().__init__(max_episode_steps)
+        self.render_mode = render_mode
 
 
 class AnyName(Limited):
@@ -83,6 +100,38 @@ def test_it_goes_before_what_the_env_is_registered_with() -> None:
         for inner in (env.unwrapped, vector.unwrapped.envs[0].unwrapped):
             assert (inner.limit, inner.size) == (7, 2)
         assert gym.registry[ENV].kwargs == {"max_episode_steps": 5, "size": 2}
+
+
+@pytest.mark.parametrize("kind", [Limited, Required, HandsOn])
+def test_one_that_it_is_registered_with_reaches_those_of_a_vector_too(kind: type[Limited]) -> None:
+    with registered(ENV, kind):
+        gym.registry[ENV].kwargs = {"max_episode_steps": 5}
+        env: Any = make_env(ENV)
+        vector: Any = make_vector_env(ENV, {}, 2)
+        assert [one.unwrapped.limit for one in (env, *vector.unwrapped.envs)] == [5, 5, 5]
+        assert length(env) == length(vector) == 5
+        # As gym.make does, it is the constructor's alone.
+        assert [wrapper_of(one, TimeLimit) for one in (env, *vector.unwrapped.envs)] == [None] * 3
+        assert check_env(ENV, {}).max_episode_steps is None
+        assert gym.registry[ENV].kwargs == {"max_episode_steps": 5}
+
+
+def test_one_that_it_is_registered_with_stays_where_the_arguments_have_another() -> None:
+    with registered(ENV, HandsOn):
+        gym.registry[ENV].kwargs = {"max_episode_steps": 5}
+        env: Any = make_env(ENV, {"max_episode_steps": 4})
+        vector: Any = make_vector_env(ENV, {"max_episode_steps": 4}, 2)
+        assert [one.unwrapped.limit for one in (env, *vector.unwrapped.envs)] == [5, 5, 5]
+        assert length(env) == length(vector) == 4
+
+
+def test_a_window_is_opened_around_what_has_none() -> None:
+    for given, args in (({"max_episode_steps": 5}, {}), ({}, {"max_episode_steps": 5})):
+        with registered(ENV, Drawn):
+            gym.registry[ENV].kwargs = given
+            env: Any = make_env(ENV, args, render_mode="human")
+            assert wrapper_of(env, HumanRendering) is not None
+            assert (env.unwrapped.render_mode, env.unwrapped.limit) == ("rgb_array", 5)
 
 
 def test_without_it_the_constructor_has_its_own() -> None:

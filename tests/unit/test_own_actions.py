@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from policy_factory import make_portable
+from policy_factory import make_portable, registered
 
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.evaluate import evaluate_policy
@@ -112,6 +112,9 @@ ENDLESS: dict[str, tuple[gym.Space[Any], list[int]]] = {
     "the other": (spaces.Box(-np.inf, 1, (2,), np.int64), [1, -7]),
     "none": (spaces.Box(-np.inf, np.inf, (2,), np.int32), [3, -7]),
     "written out": (spaces.Box(np.array([0, -99]), np.full(2, np.iinfo(np.int64).max), dtype=np.int64), [3, -7]),
+    "as Gymnasium asks": (spaces.Box(0, 2**63 - 2, (2,), np.int64), [3, 0]),
+    "of 32 bits": (spaces.Box(-99, np.iinfo(np.int32).max - 1, (2,), np.int32), [3, -7]),
+    "the least that is drawn": (spaces.Box(np.iinfo(np.int32).min + 2, 1, (2,), np.int32), [1, -7]),
 }
 
 
@@ -139,6 +142,49 @@ def test_a_space_that_was_read_draws_what_the_envs_own_does(kind: str) -> None:
         space.seed(seed)
         read.seed(seed)
         assert read.sample().tolist() == space.sample().tolist()
+
+
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_what_is_made_draws_what_it_does_once_it_is_read(kind: str) -> None:
+    given: Any = ENDLESS[kind][0]
+    own = copy.deepcopy(given)
+    made = made_of(own)
+    read = space_from_description(json.loads(json.dumps(describe_space(made))))
+    for seed in range(5):
+        made.seed(seed)
+        read.seed(seed)
+        drawn = made.sample()
+        assert drawn.tolist() == read.sample().tolist()
+        assert own.contains(made.own(drawn))
+        # Near a bound that it has, and not anywhere in all that the type holds.
+        assert np.all(np.abs(drawn) < 120)
+    # The space that it was given is left as it was.
+    assert np.array_equal(own.bounded_above, given.bounded_above)
+
+
+class Endless(gym.Env[Any, Any]):
+    """Takes all whole numbers from 0."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, most: int) -> None:
+        self.action_space = spaces.Box(0, most, (2,), np.int64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        assert self.action_space.contains(action)
+        return np.zeros(2, np.float32), 1.0, False, True, {}
+
+
+@pytest.mark.parametrize("most", [2**63 - 1, 2**63 - 2])
+def test_an_env_whose_whole_numbers_end_with_their_type_is_checked(most: int) -> None:
+    with registered("TestEndless-v0", Endless):
+        info = check_env("TestEndless-v0", {"most": most}, "ppo")
+    assert isinstance(info.action_space, Numbers)
+    assert np.all(np.isposinf(info.action_space.high))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint32, np.uint64])

@@ -352,6 +352,11 @@ def test_that_a_display_is_wanted_is_known_by_the_error_and_its_name(error: Exce
     assert (display_hint(error) is not None) is hinted
 
 
+def raised_in_c(module: str) -> Exception:
+    error: Exception = type("FatalError", (Exception,), {"__module__": module})("no more room")
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "words"),
     [
@@ -366,6 +371,13 @@ def test_that_a_display_is_wanted_is_known_by_the_error_and_its_name(error: Exce
             "libegl1",
         ),
         (OSError("X11: The DISPLAY environment variable is missing"), "xvfb-run"),
+        (RuntimeError("gladLoadGL error"), "libegl1"),
+        (RuntimeError("Offscreen framebuffer is not complete, error 0x0"), "libegl1"),
+        (RuntimeError("x11 not available"), "libegl1"),
+        (raised_in_c("mujoco"), "libegl1"),
+        (raised_in_c("OpenGL.error"), "libegl1"),
+        (raised_in_c("pygame"), "Mend its render()"),
+        (raised_in_c("my_envs"), "Mend its render()"),
     ],
 )
 def test_only_who_lacks_something_to_draw_with_is_told_to_install_it(error: Exception, words: str) -> None:

@@ -121,11 +121,14 @@ def _cost_notes(spec: SweepFields) -> list[str]:
 
 
 def _differ_in_length(spec: SweepFields) -> bool:
-    """Whether trainings end where they don't all have as many env steps: at a goal, or by another count."""
+    """Whether trainings end where they don't all have as many env steps: at a goal, by time, or by another count."""
     stop = spec.stop
     if (stop.training_return, stop.evaluation_return, stop.num_episodes) != (None, None, None):
         return True
-    is_capped = stop.num_iterations != type(stop).model_fields["num_iterations"].default
+    fields = type(stop).model_fields
+    if stop.time_s != fields["time_s"].default:
+        return True
+    is_capped = stop.num_iterations != fields["num_iterations"].default
     of_an_iteration = "train_batch_size" if spec.algorithm == "ppo" else "env_steps_per_iteration"
     return is_capped and of_an_iteration in spec.space
 
