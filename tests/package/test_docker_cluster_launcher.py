@@ -100,6 +100,21 @@ def test_what_is_installed_is_pinned_and_of_this_version(config: dict[str, Any])
     assert any(f"{wheel}[cluster]" in command for command in installs)
 
 
+def test_your_machine_gets_what_the_launcher_needs_too(config: dict[str, Any]) -> None:
+    told = (ROOT / "docker" / "README.md").read_text().partition("## Virtual machines")[2].partition("\n## ")[0]
+    commands = told.split("```")[1].splitlines()
+    (install,) = [number for number, line in enumerate(commands) if line.startswith("pip install ")]
+    words = commands[install].partition("#")[0].split()
+    assert words[2:4] == ["--constraint", "constraints.txt"]
+    head = {command.split()[-1] for command in config["head_setup_commands"]}
+    pinned = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert {"boto3"} <= head <= set(words[4:]) <= pinned
+    later = [line for line in commands if "python -m build" in line or "ray up" in line]
+    assert "build" in words[4:]
+    assert all(commands.index(line) > install for line in later)
+    assert len(later) == 2
+
+
 def test_the_first_sweep_waits_for_the_first_machine(config: dict[str, Any]) -> None:
     types = config["available_node_types"]
     assert types["head"]["resources"]["CPU"] == 0

@@ -2,15 +2,22 @@
 
 import json
 import pickle
+import re
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from policies.errors import EnvFailedError, TuneJobsError, fit, said_by, tellable
 from tests.narrowing import present
+from tune_jobs.cli.commands import cli
+from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 class MuteError(Exception):
@@ -21,6 +28,18 @@ class MuteError(Exception):
 class WordlessError(Exception):
     def __str__(self) -> str:
         return cast("str", 3)
+
+
+def kinds(kind: type[TuneJobsError]) -> list[type[TuneJobsError]]:
+    return [kind, *(inner for outer in kind.__subclasses__() for inner in kinds(outer))]
+
+
+@pytest.mark.parametrize("place", ["design.md", "reference/commands.md", "--help"])
+def test_every_list_of_exit_codes_has_all_of_them(place: str) -> None:
+    text = CliRunner().invoke(cli, [place]).output if place == "--help" else (DOCS / place).read_text()
+    paragraph = " ".join(re.split(r"Exit codes:?\n?", text)[1].strip().split("\n\n")[0].split())
+    listed = [int(code) for code in re.findall(r"(?:^|[,;] )(\d+)(?= [a-z])", paragraph)]
+    assert listed == sorted({0, INTERRUPTED, *(kind.exit_code for kind in kinds(TuneJobsError))})
 
 
 def test_what_others_wrote_is_text_that_can_be_written_and_shown() -> None:

@@ -88,6 +88,31 @@ def test_stop_names_the_storage(run: RunCommand, sweeps: FakeSweeps) -> None:
     assert "`tune-jobs resume mine` continues" in run("stop", "mine").stdout
 
 
+@RAN
+def test_a_stop_names_where_it_ran(run: RunCommand, store: SweepStore, ran: dict[str, Any], options: str) -> None:
+    change(store, state="running", **ran)
+    with store.lock():
+        told = run("stop", "mine", "--storage", "my data")
+    assert told.exit_code == 0, told.output
+    assert f"`tune-jobs resume {shlex.quote(store.place)}{options}` continues it" in told.stdout
+
+
+def test_a_stop_is_told_of_a_sweep_whose_record_is_damaged(run: RunCommand, store: SweepStore) -> None:
+    (store.folder / "sweep.json").write_text("{")
+    with store.lock():
+        told = run("stop", "mine", "--storage", "my data")
+    assert told.exit_code == 0, told.output
+    assert "`tune-jobs resume mine --storage 'my data'` continues it" in told.stdout
+
+
+def test_a_stop_by_a_service_names_that(run: RunCommand, store: SweepStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    change(store, job=JOB)
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "my data")
+    monkeypatch.setattr("tune_jobs.cli.remote.RemoteVerbs.stop", lambda *_, **__: True)
+    told = run("--server", "http://host:8470", "stop", "mine")
+    assert "`tune-jobs --server http://host:8470 resume mine` continues it" in told.stdout
+
+
 def test_a_copied_sweep_is_called_after_its_folder(run: RunCommand, store: SweepStore) -> None:
     copy = shutil.copytree(store.folder, store.folder.parent / "backup")
     rows = run("list", "--storage", copy.parent).stdout.splitlines()

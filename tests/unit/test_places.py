@@ -3,15 +3,20 @@
 import dataclasses
 import shlex
 from pathlib import Path
+from typing import cast
 
 import pytest
 from click.testing import CliRunner
-from fake_sweeps import BEST, SWEEP, TRIALS
+from fake_sweeps import BEST, SWEEP, TRIALS, RunCommand, run  # noqa: F401 (a fixture)
+from sweep_folders import make_sweep_folder
 
+import tune_jobs
 from analysis.wording import shown_part, shown_path
 from policies.errors import SpecError
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.output import show_result, show_status
+from tune_jobs.cli.remote import RemoteVerbs
+from tune_jobs.client import Client
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.store.command_names import name_in_commands, served
 from tune_jobs.store.opening import is_url, open_storage, open_sweep, sweep_of_trial
@@ -20,7 +25,9 @@ from tune_jobs.sweeps.create import CreatedSweep
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.status import SweepStatus
-from tune_jobs.sweeps.storage import place_named, split_trial, storage_place
+from tune_jobs.sweeps.storage import absolute_folder, local_path, place_named, split_trial, storage_place
+
+# ruff: noqa: F811 - fixtures are named as arguments
 
 SETTINGS = "?endpoint=http://host:9000"
 VARIABLES = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_REGION", "AWS_DEFAULT_REGION", "TUNE_JOBS_STORAGE")
@@ -183,6 +190,101 @@ def test_a_trial_is_named_behind_its_sweep(source: str, parts: tuple[str, str]) 
     assert split_trial(source) == parts
     if parts[0]:
         assert shown_part(*parts) == source
+
+
+# -- the settings of the default storage
+
+
+@pytest.mark.parametrize(
+    ("storage", "given", "place"),
+    [
+        (f"s3://bucket/sweeps{SETTINGS}", "s3://bucket/sweeps/mine", f"s3://bucket/sweeps/mine{SETTINGS}"),
+        (f"S3://bucket{SETTINGS}", "s3://bucket/other/mine/", f"s3://bucket/other/mine{SETTINGS}"),
+        ("az://c/p?account=me", "az://c/p/mine", "az://c/p/mine?account=me"),
+        (f"s3://bucket/sweeps{SETTINGS}", "s3://bucket/mine?region=x", "s3://bucket/mine?region=x"),
+        (f"s3://bucket/sweeps{SETTINGS}", "s3://Bucket/mine", "s3://Bucket/mine"),
+        (f"s3://bucket/sweeps{SETTINGS}", "gs://bucket/mine", "gs://bucket/mine"),
+        ("s3://bucket/sweeps", "s3://bucket/mine", "s3://bucket/mine"),
+        ("sweeps", "s3://bucket/mine", "s3://bucket/mine"),
+        (f"s3://other/sweeps{SETTINGS}&access_key=hunter2", "s3://bucket/mine", "s3://bucket/mine"),
+    ],
+)
+def test_a_url_without_settings_takes_those_of_the_default_storage_in_its_bucket(
+    monkeypatch: pytest.MonkeyPatch, storage: str, given: str, place: str
+) -> None:
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", storage)
+    assert place_named(given) == place
+    assert place_named(place) == place
+
+
+def test_they_precede_those_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://a:1")
+    monkeypatch.setenv("AWS_REGION", "eu-1")
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", f"s3://bucket/sweeps{SETTINGS}")
+    assert place_named("s3://bucket/sweeps/mine") == storage_place(None).replace("sweeps", "sweeps/mine")
+    assert "endpoint=http://host:9000" in place_named("s3://bucket/sweeps/mine")
+
+
+def test_credentials_in_the_default_storage_are_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", f"s3://bucket/sweeps{SETTINGS}&access_key=hunter2")
+    with pytest.raises(SpecError, match=r"\$TUNE_JOBS_STORAGE has credentials in its settings") as raised:
+        place_named("s3://bucket/sweeps/mine")
+    assert "hunter2" not in str(raised.value)
+
+
+# -- what is written on this machine
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("reproduce", "mine/t0001", "--out"),
+        ("video", "random", "--env", "CartPole-v1", "--output"),
+        ("export", "mine", "--out"),
+        ("token", "list", "--folder"),
+    ],
+)
+@pytest.mark.parametrize("url", ["s3://key:hunter2@b/p", "S3:/b/p", "file:///x", "gs://b"])
+def test_no_url_becomes_a_folder_of_this_machine(
+    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], url: str
+) -> None:
+    monkeypatch.setattr("tune_jobs.sweeps.reproduce._train_again", lambda *_: pytest.fail("it trains"))
+    make_sweep_folder(tmp_path / "sweeps" / "mine")
+    told = run(*words, url)
+    assert told.exit_code == SpecError.exit_code, told.output
+    assert "written on this machine" in told.stderr
+    assert "hunter2" not in told.output
+    assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
+
+
+@pytest.mark.parametrize("url", ["s3://key:hunter2@b/p/", "s3:/b/p.mp4"])
+def test_no_url_becomes_one_for_what_a_service_has(url: str) -> None:
+    """Nothing is asked of the service before."""
+    remote = RemoteVerbs(cast("Client", None))
+    for call in (
+        lambda: remote.report("mine", output=url),
+        lambda: remote.video("mine", output=url),
+        lambda: remote.export(["mine"], "sweep", output=url),
+    ):
+        with pytest.raises(SpecError, match="written on this machine"):
+            call()
+
+
+def test_a_comparison_is_written_to_no_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_sweep_folder(tmp_path / "mine")
+    with pytest.raises(SpecError, match="written on this machine"):
+        tune_jobs.compare([tmp_path / "mine/t0000", tmp_path / "mine/t0002"], html="s3://b/page.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_what_only_looks_like_a_url_is_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/me")
+    given = ("./s3:/b", "s3-results", "a/s3://b", "~/films/")
+    assert [str(local_path(path)) for path in given] == ["s3:/b", "s3-results", "a/s3:/b", "/home/me/films"]
+    assert absolute_folder(Path("own")) == tmp_path / "own"
+    assert absolute_folder(None) is None
 
 
 # -- opened, and told

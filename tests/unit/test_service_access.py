@@ -4,7 +4,8 @@ import pytest
 from service_access import OPEN, SWEEP, URL, Place, bearer, place, problem, shared  # noqa: F401 (fixture)
 
 from policies.errors import SpecError
-from tune_jobs.service.access.hosts import public_host
+from tune_jobs.service.access.hosts import ServedNames, public_host
+from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.service import Service
 
 # ruff: noqa: F811 - fixtures are named as arguments
@@ -57,6 +58,29 @@ def test_who_listens_everywhere_is_known_by_the_address_that_was_called(shared: 
     problem(at.client("http://192.0.2.7:8265").get(ME, headers={"Host": "192.0.2.8:8265", **headers}), 400)
     problem(at.client("http://evil.example:8265").get(ME, headers=headers), 400)
     problem(place(shared).client("http://192.0.2.7:8265").get(ME), 400)
+
+
+@pytest.mark.parametrize(
+    ("address", "called", "host", "is_known"),
+    [
+        ("::", "::ffff:192.168.0.5", "192.168.0.5", True),
+        ("::", "::ffff:192.168.0.5", "[::ffff:192.168.0.5]", True),
+        ("::", "::ffff:192.168.0.5", "192.168.0.6", False),
+        ("::", "fe80::1%eth0", "[fe80::1]", True),
+        ("::", "fe80::1", "192.168.0.5", False),
+        ("0.0.0.0", "192.168.0.5", "192.168.0.5", True),
+        ("::1", "::ffff:192.168.0.5", "192.168.0.5", False),
+    ],
+)
+def test_a_socket_of_version_6_is_known_by_addresses_of_version_4(
+    address: str, called: str, host: str, *, is_known: bool
+) -> None:
+    names, headers = ServedNames(address), {b"host": [f"{host}:8470".encode()]}
+    if is_known:
+        assert names.check_host(headers, "http", (called, 8470)).port == 8470
+    else:
+        with pytest.raises(RefusedError, match="not known as"):
+            names.check_host(headers, "http", (called, 8470))
 
 
 @pytest.mark.parametrize(

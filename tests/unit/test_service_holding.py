@@ -48,6 +48,25 @@ def config(storage: Path, url: str) -> ServiceConfig:
     return ServiceConfig(storage=storage, database=url, spare_idle_s=0.0)
 
 
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_folder_is_one_services_and_is_named(tmp_path: Path, *, is_own: bool) -> None:
+    storages = (tmp_path / "a", tmp_path / ("b" if is_own else "a"))
+    first, second = (ServiceConfig(path, own_folder=tmp_path / "own" if is_own else None) for path in storages)
+    named, option = (tmp_path / "own", "--folder") if is_own else (tmp_path / "a", "--storage")
+    with module._alone(first), pytest.raises(CannotRunError) as refused, opened(second):
+        pass
+    assert refused.value.message == f"Another service has the {'' if is_own else 'storage '}folder {named}."
+    assert refused.value.hint == f"End it first, or give another {option}."
+
+
+def test_an_own_folder_that_is_a_file_is_no_matter_of_the_storage(tmp_path: Path) -> None:
+    (tmp_path / "own").touch()
+    with pytest.raises(CannotRunError) as refused, opened(ServiceConfig(tmp_path, own_folder=tmp_path / "own")):
+        pass
+    assert str(tmp_path / "own") in refused.value.message
+    assert refused.value.hint == "Check the folder."
+
+
 def test_a_second_service_is_refused_and_leaves_the_first_ones_jobs_alone(tmp_path: Path, database_url: str) -> None:
     first, second = (config(tmp_path / name, database_url) for name in "ab")
 

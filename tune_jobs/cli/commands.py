@@ -64,9 +64,9 @@ def cli(ctx: click.Context, /, *, debug: bool, server: str | None, token_file: s
 
     SPEC is a sweep file or a preset; SWEEP is a sweep's name or folder.
 
-    Exit codes: 0 done, 2 bad sweep file or arguments, 3 some trials or the best's confirmation failed, or a reproduced
-    trial differs, 4 no such
-    sweep, trial or checkpoint, 5 cannot run here, 130 interrupted.
+    Exit codes: 0 done, 1 it failed at the service, or an unexpected error, 2 bad sweep file or arguments, 3 some trials
+    or the best's confirmation failed, or a reproduced trial differs, 4 no such sweep, trial or checkpoint, 5 cannot run
+    here, 130 interrupted.
     """
     ctx.meta[DEBUG] = debug
     remember_server(ctx, server, token_file, ca_file)
@@ -223,7 +223,8 @@ def stop(*, sweep: str, storage: str | None, as_json: bool) -> None:
     sweeps = verbs()
     with stdout_for(as_json=as_json):
         was_running = sweeps.stop(sweep, storage=storage)
-    cli_output.show_stop(sweep, was_running=was_running, storage=storage, program=program(), as_json=as_json)
+        go_on = cli_output.going_on(sweep, storage) if was_running and not as_json else ""
+    cli_output.show_stop(sweep, was_running=was_running, go_on=go_on, as_json=as_json)
 
 
 @cli.command()

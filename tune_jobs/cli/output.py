@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 import sys
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, range_text, return_text, setting_text
+from policies.errors import TuneJobsError
 from tune_jobs.process.interruption import last_words
 from tune_jobs.sweeps.plain import to_json
 
@@ -294,17 +296,28 @@ def show_paths(paths: Mapping[str, Path], *, as_json: bool) -> None:
         print_facts(make_console(), {name: shown_path(path) for name, path in paths.items()})
 
 
-def show_stop(
-    sweep: str, *, was_running: bool, storage: str | None = None, program: str = "tune-jobs", as_json: bool
-) -> None:
-    """Print whether there was something to stop."""
+def going_on(sweep: str, storage: str | None) -> str:
+    """Return the command that goes on with a sweep, where it ran: as far as its record says it, or at the service."""
+    from tune_jobs.cli.server import program, server_of
+
+    if server_of() is not None:
+        return f"{program()} resume {shlex.quote(sweep)}"
+    from tune_jobs.store.opening import resume_command
+    from tune_jobs.sweeps.sources import find_sweep
+
+    # What was asked for is done: a record that can't be read now makes no error of it.
+    with contextlib.suppress(TuneJobsError):
+        store = find_sweep(sweep, storage)
+        return resume_command(store, store.read_record())
+    return f"tune-jobs resume {shlex.quote(sweep)}{storage_option_of(storage)}"
+
+
+def show_stop(sweep: str, *, was_running: bool, go_on: str, as_json: bool) -> None:
+    """Print whether there was something to stop, and the command that goes on with it."""
     if as_json:
         print_json({"sweep": sweep, "was_running": was_running})
     elif was_running:
-        click.echo(
-            f"{sweep} stops after the iterations now running; "
-            f"`{program} resume {shlex.quote(sweep)}{storage_option_of(storage)}` continues it."
-        )
+        click.echo(f"{sweep} stops after the iterations now running; `{go_on}` continues it.")
     else:
         click.echo(f"{sweep} is not running.")
 

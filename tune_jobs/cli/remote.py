@@ -70,7 +70,7 @@ class RemoteVerbs:
     def report(self, sweep: str, *, output: str | None = None, **_: Any) -> Path:
         """Download the page of a sweep's report, and return its path."""
         default = f"{sweep}-report.html"
-        to = Path(default) if output is None else Path(output) / default if _is_folder(output) else Path(output)
+        to = _target(output, default)
         return self._client.download(sweep, "report/", to)
 
     def video(self, source: str, *, output: str | None = None, **_: Any) -> dict[str, Path]:
@@ -87,18 +87,18 @@ class RemoteVerbs:
             raise SpecError(
                 f"A service has films of sweeps' best policies; {source!r} is no sweep.", "Name a sweep, by its name."
             )
+        target = _target(output, "")
         there = {file.path for file in self._client.files(source)}
         # Only names that are known here: others might lead out of the folder.
         known = [film for film in get_args(Film) if _FILMS + film in there]
         if output is None or _is_folder(output):
-            wanted = {film: Path(output or ".") / f"{source}-{'.'.join(film.rsplit('_', 1))}" for film in known}
+            wanted = {film: target / f"{source}-{'.'.join(film.rsplit('_', 1))}" for film in known}
             names = {film: film for film in known}
         else:
             names = {film: film.removeprefix("after_") for film in ("after_mp4", "after_gif") if film in known}
             # Another suffix, such as that of `cartpole-v0.5`, is kept, as it is where the folder is.
-            path = Path(output)
-            stem = path.stem if path.suffix.lower() in (".mp4", ".gif") else path.name
-            wanted = {film: path.with_name(f"{stem}.{suffix}") for film, suffix in names.items()}
+            stem = target.stem if target.suffix.lower() in (".mp4", ".gif") else target.name
+            wanted = {film: target.with_name(f"{stem}.{suffix}") for film, suffix in names.items()}
         if not wanted:
             raise NotFoundError(
                 f"Sweep {source} has no film of its best policy.", "They are made when the sweep has ended."
@@ -120,7 +120,7 @@ class RemoteVerbs:
                 "Write `export SWEEP --format sweep`.",
             )
         default = f"{sweeps[0]}{_ONE_FILE}"
-        to = Path(default) if output is None else Path(output) / default if _is_folder(output) else Path(output)
+        to = _target(output, default)
         if to.suffix.lower() != _ONE_FILE:
             to = to.with_name(f"{to.name}{_ONE_FILE}")
         return {"sweep": self._client.download(sweeps[0], "file", to)}
@@ -160,3 +160,13 @@ def told_here(error: SpecError, source: str, overrides: Sequence[str]) -> SpecEr
 
 def _is_folder(output: str) -> bool:
     return output.endswith("/") or Path(output).is_dir()
+
+
+def _target(output: str | None, default: str) -> Path:
+    """Return the file to write on this machine: `output`, or the default name in that folder."""
+    from tune_jobs.sweeps.storage import local_path
+
+    if output is None:
+        return Path(default)
+    path = local_path(output)
+    return path / default if _is_folder(output) else path

@@ -9,7 +9,6 @@ import shlex
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from sqlalchemy import Engine
 
@@ -75,7 +74,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
         CannotRunError: Another service has this storage folder or the database, they can't be used, or nobody could
             come in.
     """
-    with _alone(config.folder), served(config.place), _database(config) as (engine, hold):
+    with _alone(config), served(config.place), _database(config) as (engine, hold):
         gate = _gate(config, engine)
         storage, queue, labels = open_storage(config.place), Queue(engine), Labels(engine)
         statuses = Statuses(storage)
@@ -177,20 +176,24 @@ def _where(config: ServiceConfig) -> str:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _alone(config: ServiceConfig) -> Iterator[None]:
+    folder, is_own = config.folder, config.own_folder is not None
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         raise CannotRunError(
-            f"The service can't write {folder}: {error.strerror}.", "Check the storage folder."
+            f"The service can't write {folder}: {error.strerror}.", f"Check the {'' if is_own else 'storage '}folder."
         ) from error
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise CannotRunError(
-                f"Another service has the storage folder {folder.parent}.", "End it first, or give another --storage."
+                f"Another service has the folder {folder}."
+                if is_own
+                else f"Another service has the storage folder {folder.parent}.",
+                f"End it first, or give another {'--folder' if is_own else '--storage'}.",
             ) from error
         yield
     finally:

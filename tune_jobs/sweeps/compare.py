@@ -18,7 +18,7 @@ from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.exports import sweep_data
 from tune_jobs.sweeps.sources import find_source, find_trial
-from tune_jobs.sweeps.storage import expanded
+from tune_jobs.sweeps.storage import local_path
 
 
 @checked
@@ -46,7 +46,7 @@ def compare(
 
     Raises:
         NotFoundError: There is no such sweep or trial.
-        SpecError: Fewer than two different things, or too many, are to be compared.
+        SpecError: Fewer than two different things, or too many, are to be compared, or the page is a URL.
         CannotRunError: The page cannot be written.
     """
     named = [sources] if isinstance(sources, str | Path) else list(sources)
@@ -54,7 +54,7 @@ def compare(
     if html is not None:
         from analysis.comparison.page import write_page
 
-        write_page(expanded(html), found, wanted)
+        write_page(local_path(html), found, wanted)
     return found
 
 

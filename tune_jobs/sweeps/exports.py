@@ -10,7 +10,7 @@ from analysis.exports.frames import ROWS, Rows, SweepData
 from policies.arguments import Inches, PositiveInt, checked
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.sweeps.gathered import spec_of, sweep_data
-from tune_jobs.sweeps.storage import expanded
+from tune_jobs.sweeps.storage import local_path
 
 if TYPE_CHECKING:
     import optuna
@@ -134,7 +134,7 @@ def export(
 
     Raises:
         NotFoundError: There is no such sweep, or nothing of it to draw.
-        SpecError: Several sweeps are given for a table, or the sweep has no form of this kind.
+        SpecError: Several sweeps are given for a table, the sweep has no form of this kind, or the output is a URL.
         CannotRunError: A file cannot be written, or a package is not installed.
     """
     from tune_jobs.sweeps.sources import find_sweep
@@ -153,7 +153,7 @@ def export(
         )
     store = find_sweep(names[0], storage)
     suffix = _SUFFIXES.get(kind, f"-{kind}")
-    path = Path(f"{store.name}{suffix}") if output is None else expanded(output)
+    path = Path(f"{store.name}{suffix}") if output is None else local_path(output)
     if kind in _SUFFIXES and path.is_dir():
         path /= f"{store.name}{suffix}"
     elif kind in _SUFFIXES and path.suffix.lower() != suffix:

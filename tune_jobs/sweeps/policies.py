@@ -16,7 +16,7 @@ from policies.envs.modules import allowed_again
 from policies.guard.guard import guarding
 from tune_jobs.sweeps.outcome import Progress
 from tune_jobs.sweeps.results import Films
-from tune_jobs.sweeps.storage import expanded
+from tune_jobs.sweeps.storage import expanded, local_path
 
 if TYPE_CHECKING:
     from ray.rllib.algorithms.algorithm import Algorithm
@@ -120,11 +120,15 @@ def video(
     Raises:
         NotFoundError: There is no such policy.
         EnvError: The environment cannot be drawn.
+        SpecError: The output is a URL.
     """
     from tune_jobs.sweeps import conclude as finish
     from tune_jobs.sweeps.filming import telling_frames
     from tune_jobs.sweeps.live_view import working
 
+    if output is not None:
+        # Before the policy is chosen, which may take minutes.
+        local_path(output)
     with working(str(source), "reading the policy", progress) as say:
         found = finish.find_policy(source, storage, env_id, action, say)
         with telling_frames(say, "filming"):

@@ -39,7 +39,7 @@ from tune_jobs.sweeps.outcome import Progress, SweepResult
 from tune_jobs.sweeps.repeating import plan_of_repetition
 from tune_jobs.sweeps.sources import find_source, find_trial
 from tune_jobs.sweeps.stages import run_sweep
-from tune_jobs.sweeps.storage import expanded, folder_at
+from tune_jobs.sweeps.storage import folder_at, local_path
 
 _LONG_S = 1e9
 _WEIGHTS = "policy.safetensors"
@@ -72,8 +72,8 @@ def reproduce(
 
     Raises:
         NotFoundError: There is no such trial, or it has done no iteration.
-        SpecError: No trial was named, or it is one of population based training, which continued from checkpoints of
-            others.
+        SpecError: No trial was named, it is one of population based training, which continued from checkpoints of
+            others, or the folder is a URL.
         CannotRunError: It cannot run here, or the folder exists or cannot be written.
         SweepInterrupted: Ctrl-C, SIGTERM or SIGHUP ended it.
     """
@@ -132,7 +132,7 @@ def _folder(output: str | Path | None, name: str) -> tuple[Path, bool]:
     """Return the folder of the repetition, and whether it is kept."""
     if output is None:
         return Path(tempfile.mkdtemp(prefix="tune-jobs-reproduce-")) / name, False
-    folder = expanded(output)
+    folder = local_path(output)
     if os.path.lexists(folder):
         raise CannotRunError(f"{folder} exists already.", "Give a folder that does not exist; it is made.")
     return folder, True

@@ -46,8 +46,8 @@ def place_named(place: str | Path) -> str:
     """Return a place that a user named, as every process opens it.
 
     A URL gets what the environment says of its store, so that processes with another environment reach the same one:
-    for s3, the `endpoint` ($AWS_ENDPOINT_URL_S3, else $AWS_ENDPOINT_URL) and the `region` ($AWS_REGION, else
-    $AWS_DEFAULT_REGION).
+    one without settings those of $TUNE_JOBS_STORAGE, if that is in the same bucket; and for s3, the `endpoint`
+    ($AWS_ENDPOINT_URL_S3, else $AWS_ENDPOINT_URL) and the `region` ($AWS_REGION, else $AWS_DEFAULT_REGION).
 
     Args:
         place: A folder, of which ~ is replaced, and which may be relative; or a URL.
@@ -71,12 +71,12 @@ def place_named(place: str | Path) -> str:
             f"Sweeps can't be kept at {scheme}://: known are {_KNOWN}, file:// and folders.",
             "Choose one of these; an S3-compatible server is s3://BUCKET/PREFIX?endpoint=http://HOST:PORT.",
         )
-    _refuse_secrets(scheme, found)
+    _refuse_secrets(f"The {scheme}:// URL", scheme, found)
     parts = found["path"].strip("/").split("/") if found["path"].strip("/") else []
     if not found["bucket"] or {"", ".", ".."} & set(parts):
         what = "names no bucket" if not found["bucket"] else "has an empty part, or one that is . or .."
         raise SpecError(f"The URL {place!r} {what}.", f"Give {scheme}://BUCKET/PREFIX.")
-    settings = dict(parse_qsl(found["query"] or "", keep_blank_values=True))
+    settings = dict(parse_qsl(found["query"] or _query_of_default(scheme, found["bucket"]), keep_blank_values=True))
     if scheme == "s3":
         settings = _from_environment() | settings
     query = urlencode(settings, quote_via=quote, safe=":/")
@@ -89,18 +89,27 @@ def _folder_named(found: re.Match[str]) -> str:
     return str(folder_of(found.group()))
 
 
-def _refuse_secrets(scheme: str, url: re.Match[str]) -> None:
+def _query_of_default(scheme: str, bucket: str) -> str:
+    """Return the query of $TUNE_JOBS_STORAGE, if that is in this bucket; else nothing."""
+    found = _URL.fullmatch(os.environ.get("TUNE_JOBS_STORAGE", ""))
+    if found is None or (found["scheme"].lower(), found["bucket"]) != (scheme, bucket):
+        return ""
+    _refuse_secrets("$TUNE_JOBS_STORAGE", scheme, found)
+    return found["query"] or ""
+
+
+def _refuse_secrets(named: str, scheme: str, url: re.Match[str]) -> None:
     """Raise an error if there may be credentials in a URL; it repeats nothing of it."""
     if ":" in url["bucket"]:
         # A secret may have a slash in it, so that its end stands in what looks like the prefix.
         raise SpecError(
-            f"The {scheme}:// URL has a colon where its bucket is named: credentials, or a port.",
+            f"{named} has a colon where its bucket is named: credentials, or a port.",
             f"{_WITHOUT_SECRETS} A server's address is a setting: {scheme}://BUCKET/PREFIX?endpoint=http://HOST:PORT.",
         )
     names = [name for name, value in parse_qsl(url["query"] or "") if _SECRET.search(name) or "@" in value]
     if "@" in url["bucket"] or names:
         where = f"in its settings ({', '.join(map(repr, names))})" if names else "before its bucket"
-        raise SpecError(f"The {scheme}:// URL has credentials {where}.", _WITHOUT_SECRETS)
+        raise SpecError(f"{named} has credentials {where}.", _WITHOUT_SECRETS)
 
 
 def _from_environment() -> dict[str, str]:
@@ -130,8 +139,27 @@ def split_trial(source: str) -> tuple[str, str]:
 
 
 def absolute_folder(folder: Path | None) -> Path | None:
-    """Return a folder of this machine as an absolute one, with ~ replaced; None stays None."""
-    return None if folder is None else absolute(expanded(folder))
+    """Return a folder of this machine as an absolute one, with ~ replaced; None stays None.
+
+    Raises:
+        SpecError: It is a URL.
+    """
+    return None if folder is None else absolute(local_path(folder))
+
+
+def local_path(path: str | Path) -> Path:
+    """Return the path of what is to be written on this machine, with ~ replaced.
+
+    Raises:
+        SpecError: It is a URL, of which a folder called after the scheme would be made here.
+    """
+    if _URL.match(str(path)) or _SLASH_LOST.match(str(path)):
+        # It may have credentials in it: only the scheme is repeated.
+        scheme = str(path).partition(":")[0]
+        raise SpecError(
+            f"A URL ({scheme}://) is given for what is written on this machine.", "Give a folder or file of it."
+        )
+    return expanded(path)
 
 
 def expanded(path: str | Path) -> Path:

@@ -99,7 +99,7 @@ class ServedNames:
         if not self._is_everywhere:
             return False
         try:
-            return ipaddress.ip_address(host.name.strip("[]")) == ipaddress.ip_address(address.partition("%")[0])
+            return _address(host.name.strip("[]")) == _address(address.partition("%")[0])
         except ValueError:
             return False
 
@@ -139,6 +139,13 @@ def check_fetch_site(headers: Mapping[bytes, list[bytes]], method: str) -> bool:
         if not (is_link and method == "GET"):
             raise RefusedError(403, f"{_NOT_SAFE}, as the browser says.", "Use the service's own page.")
     return site == "same-origin"
+
+
+def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    address = ipaddress.ip_address(text)
+    # So a socket of version 6 says those of version 4: ::ffff:192.168.0.5.
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return mapped or address
 
 
 def _only(headers: Mapping[bytes, list[bytes]], name: bytes) -> str | None:
