@@ -61,12 +61,13 @@ def meaning_of(point: Mapping[str, Any]) -> str:
 
     As in sweep files, 2e3 is 2000 and [64] is 64, but true is not 1.
     """
-    return json.dumps({name: _in_one_form(value) for name, value in point.items()}, sort_keys=True, default=str)
+    return json.dumps({name: in_one_form(value) for name, value in point.items()}, sort_keys=True, default=str)
 
 
-def _in_one_form(value: Any) -> Any:
+def in_one_form(value: Any) -> Any:
+    """Return a value as every other way to write it has it, too."""
     if isinstance(value, list | tuple):
-        items = list(map(_in_one_form, value))
+        items = list(map(in_one_form, value))
         return items[0] if len(items) == 1 and is_number(items[0]) else items
     return int(value) if isinstance(value, float) and value.is_integer() else value
 

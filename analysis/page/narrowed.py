@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.domains import CONDITION, LISTED_KINDS, NEAR_ONE, arguments_of, conditions_of, is_log_kind, kind_of
+from analysis.points import in_one_form
 from analysis.wording import is_number
 
 _MARGIN = 0.25
@@ -36,9 +37,8 @@ def _narrowed(domain: Any, values: Sequence[Any]) -> Any:
     if not kind or not values or not isinstance(ends, list | tuple):
         return domain
     if kind in LISTED_KINDS:
-        # As text, as lists can't be in a set, and a tuple is the same value as a list.
-        known = {json.dumps(value) for value in values}
-        kept = [value for value in ends if json.dumps(value) in known]
+        known = set(map(_meaning, values))
+        kept = [value for value in ends if _meaning(value) in known]
         return {**domain, kind: kept or ends}
     if len(ends) < 2 or not all(is_number(value) and math.isfinite(value) for value in (*ends, *values)):
         return domain
@@ -68,10 +68,15 @@ def _has(domain: Any, value: Any) -> bool:
     """Whether a domain has a value, as far as a condition needs to know."""
     kind, ends = kind_of(domain), arguments_of(domain)
     if kind in LISTED_KINDS and isinstance(ends, list | tuple):
-        return json.dumps(value) in map(json.dumps, ends)
+        return _meaning(value) in map(_meaning, ends)
     if not is_number(value) or not isinstance(ends, list | tuple) or len(ends) < 2 or not all(map(is_number, ends)):
         return False
     return bool(ends[0] <= value and (value < ends[1] if kind in ("randint", "lograndint") else value <= ends[1]))
+
+
+def _meaning(value: Any) -> str:
+    """Return a text that is equal for values that mean the same: lists can't be in a set."""
+    return json.dumps(in_one_form(value), default=str)
 
 
 def _range(kind: str, ends: Sequence[float], values: Sequence[float]) -> list[float]:

@@ -25,8 +25,10 @@
     const [size, letter] = value >= 1e9 ? [1e9, "G"] : value >= 1e6 ? [1e6, "M"] : value >= 1e3 ? [1e3, "k"] : [1, ""];
     return +(value / size).toPrecision(4) + letter;
   };
+  // Whole numbers with all of their digits, as in the tables: a batch of 65,536 is not one of 65,540.
+  const exact = (value) => (Number.isInteger(value) && Math.abs(value) < 1e15 ? value.toLocaleString("en") : short(value));
   const said = (axis, value) => (axis.kind === "category" ? axis.labels[value]
-    : /env steps/.test(axis.name) ? Math.round(value).toLocaleString("en") : short(value));
+    : exact(/env steps/.test(axis.name) ? Math.round(value) : value));
 
   // What a part of the page is made of; texts are never read as HTML.
   function element(name, className, ...content) {

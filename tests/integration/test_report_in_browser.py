@@ -141,6 +141,28 @@ def test_marks_tell_their_numbers_and_a_legend_hides_lines(page: webdriver.Chrom
     assert wait(page, "return arguments[0].querySelectorAll('path').length < arguments[1]", plot, num_paths)
 
 
+def test_whole_numbers_are_told_with_all_of_their_digits(browser: webdriver.Chrome, tmp_path: Path) -> None:
+    sizes = (65536, 1000, 12345)
+    points = [{"train_batch_size": size, "lr": lr} for size, lr in zip(sizes, (0.0012341, 0.002, 0.003), strict=True)]
+    made = make_sweep(points=points, with_best=False)
+    space = {"train_batch_size": {"lograndint": [1000, 70000]}, "lr": {"loguniform": [1e-4, 1e-2]}}
+    sweep = made.sweep.model_copy(update={"spec": made.sweep.spec | {"space": space}})
+    report = build_report(
+        str(tmp_path), target=tmp_path / "report", sweep=sweep, trials=made.trials, results=made.results,
+        best=None, videos={},
+    )  # fmt: skip
+    browser.get(report.as_uri())
+    plot = drawn(browser, "hyperparameters")
+    tip = """
+        const chart = echarts.getInstanceByDom(arguments[0]);
+        chart.dispatchAction({ type: "showTip", seriesIndex: 0, dataIndex: arguments[1] });
+        return arguments[0].querySelector(".tip")?.innerText;
+    """
+    for index, (size, lr) in enumerate([("65,536", "0.001234"), ("1,000", "0.002"), ("12,345", "0.003")]):
+        told = wait(browser, tip, plot, index).splitlines()
+        assert {f"train_batch_size: {size}", f"lr: {lr}"} <= set(told)
+
+
 @pytest.mark.parametrize("width", [400, 1280, 1920])
 def test_charts_fit_and_follow_width_and_theme(page: webdriver.Chrome, width: int) -> None:
     emulate(page, width=width, theme="light")

@@ -6,6 +6,8 @@ import pytest
 from live_service import Live
 from page_browser import IN_A_BROWSER, Page
 
+from analysis.wording import setting_text, short_text
+
 pytestmark = IN_A_BROWSER
 RANGES = """
     const [{ axesOf }, [kind, values]] = [module, given];
@@ -56,6 +58,23 @@ TABLE = """
 """
 
 STATES = "return given.map((sweep) => [module.stateOf(sweep).word, module.stateReason(sweep), module.isDone(sweep)]);"
+SHOWN = """
+    const searched = [{ name: "lr", kind: "log", values: [], isNumber: true }];
+    const of = (name) => import(new URL(`static/js/${name}.js`, document.baseURI));
+    return Promise.all([of("parallel_axes"), of("trial_columns")]).then(([{ axesOf }, { columnsOf }]) => {
+      const column = columnsOf(searched, false).find(({ key }) => key === "lr");
+      const [axis] = axesOf(searched, given);
+      const data = Object.assign(new module.SweepData(null), { trials: given, spec: {} });
+      const points = data.rankedPoints(given);
+      const told = given.map((trial, index) => [column.text(trial), axis.valueOf(trial), points[index].point.lr]);
+      return [data.findSearched().map(({ name }) => name), told];
+    });
+"""
+NEAR_ONE = "return given.map((value) => [module.settingText(value, 3), module.settingText(value, 4)]);"
+CONDITIONS = """
+    return given.map(({ space, values }) =>
+      [module.numCombinations(space), values.map((each) => module.acts(space, "num_epochs", { hidden_sizes: each }))]);
+"""
 
 
 def run_module(page: Page, name: str, script: str, given: Any) -> Any:
@@ -90,6 +109,35 @@ def test_a_range_to_the_end_of_an_axis_has_the_trial_that_lies_there(
     assert low in lower[1]
     assert high not in lower[1]
     assert lower[2][0] == 0
+
+
+def test_a_trial_is_shown_with_the_values_that_its_score_was_reached_with(page: Page) -> None:
+    trial = {"status": "completed", "seed_index": 0, "training_return": None, "num_env_steps": 1, "time_s": 1.0}
+    given = [
+        {**trial, "trial_id": "t0000", "index": 0, "point_index": 0, "score": 480.0, "point": {"lr": 0.0005},
+         "score_point": {"lr": 0.01}},
+        {**trial, "trial_id": "t0001", "index": 1, "point_index": 1, "score": 20.0, "point": {"lr": 0.002},
+         "score_point": None},
+    ]  # fmt: skip
+    names, told = run_module(page, "sweep_data", SHOWN, given)
+    assert names == ["lr"]
+    assert told == [["0.01", 0.01, 0.01], ["0.002", 0.002, 0.002]]
+
+
+def test_what_is_nearly_one_has_the_digits_that_the_command_line_gives(page: Page) -> None:
+    values = [0.9, 0.9904, 0.99, 0.9994, 0.9995537, 0.99999, 0.95, 0.912345, 0.89, 1.0, 0.5, 123.456]
+    told = run_module(page, "format", NEAR_ONE, values)
+    assert told == [[short_text(value), setting_text(value)] for value in values]
+
+
+def test_a_condition_may_name_a_list_of_one_layer_by_its_number(page: Page) -> None:
+    def space(sizes: list[Any], named: Any) -> dict[str, Any]:
+        return {"hidden_sizes": {"grid": sizes}, "num_epochs": {"grid": [2, 4, 8], "when": {"hidden_sizes": named}}}
+
+    given = [space([[64], [64, 64]], 64), space([64, [64, 64]], [64]), space([[64], [64, 64]], [64, 64])]
+    values = [[64], 64, [64, 64], [32]]
+    told = run_module(page, "domains", CONDITIONS, [{"space": each, "values": values} for each in given])
+    assert told == [[4, [True, True, False, False]]] * 2 + [[4, [False, False, True, False]]]
 
 
 def test_a_list_with_one_key_twice_stays_as_long_as_it_is(page: Page) -> None:

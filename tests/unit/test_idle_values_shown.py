@@ -197,6 +197,17 @@ def test_a_narrower_space_drops_what_could_never_act_in_it() -> None:
     assert kept["double_q"]["when"] == {"n_step": 2}
 
 
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [([1000.0, 2000.0], 2000), ([1000, 2000], 2e3), ([[64], [64, 64]], 64), ([64, [64, 64]], [64])],
+)
+def test_a_condition_may_write_a_value_in_another_form_than_the_list(values: list[Any], named: Any) -> None:
+    space = {"x": {"choice": values}, "n_step": {"choice": [1, 2], "when": {"x": named}}}
+    points = [{"x": value, "n_step": 1} for value in values]
+    assert narrowed_space(space, points) == {"x": {"choice": values}, "n_step": {"choice": [1], "when": {"x": named}}}
+    assert narrowed_space(space, [{"x": named, "n_step": 1}])["x"]["choice"] in ([values[0]], [values[1]])
+
+
 LAYERS = {"layers": {"number": [1, 2], "sizes": {"choice": [8]}}}
 
 

@@ -135,10 +135,10 @@ def test_what_takes_long_is_done_less_often_and_yet_done(
     clock, sums = Clock(), []
     original = status_of
 
-    def slow(*arguments: Any) -> Any:
+    def slow(*arguments: Any, **named: Any) -> Any:
         clock.now += 0.06
         sums.append(clock.now)
-        return original(*arguments)
+        return original(*arguments, **named)
 
     monkeypatch.setattr(module, "status_of", slow)
     statuses = Statuses(open_storage(store.folder.parent), clock)

@@ -74,6 +74,9 @@ class Trial(TrialRecord):
     """A trial's record, and its score."""
 
     score: float | None = Field(description="Of its best checkpoint; None: it can't win.")
+    score_point: dict[str, Any] | None = Field(
+        None, description="The values that it was reached with; None: those of `point`, as nearly always."
+    )
 
 
 class Curve(_Answer):

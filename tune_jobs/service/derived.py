@@ -147,10 +147,10 @@ class Derived:
         Raises:
             NotFoundError: There is no such sweep, or it is damaged.
         """
-        from tune_jobs.store.candidates import read_trials
+        from tune_jobs.sweeps.results import trials_as_left
 
         def records_of(sweep: Sweep) -> bytes:
-            return b"[%s]" % b",".join(record.model_dump_json().encode() for record in read_trials(sweep))
+            return b"[%s]" % b",".join(record.model_dump_json().encode() for record in trials_as_left(sweep))
 
         found: bytes = self._get(name, "records", records_of)
         return found

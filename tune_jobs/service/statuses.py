@@ -21,7 +21,7 @@ from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.store.patience import impatient
 from tune_jobs.sweeps.reached import as_reached, reached_by_now
-from tune_jobs.sweeps.status import SweepStatus, status_of
+from tune_jobs.sweeps.status import SweepStatus, as_left, status_of, was_killed
 
 FRESH_S = 0.4
 """How old what is told of a running sweep may be; of one with thousands of trials it may be older."""
@@ -61,13 +61,17 @@ class Seen:
 
     status: SweepStatus
     trials: Trials
-    """Its trials, those that run with what they have trained since they were written, where that is long ago."""
+    """Its trials, those that run with what they have trained since they were written, where that is long ago.
+
+    Those that ran when its process was killed are paused."""
     written: Trials
     """Its trials as their records have them."""
     written_at: float
     """When it was noticed that a record was written; monotonic seconds."""
     reached: Mapping[str, Reached]
     """How far running trials are within their iterations, by their ids, as far as it was looked for."""
+    was_killed: bool
+    """Whether its process was killed before it could write which trials it left."""
     stamp: tuple[int, ...]
     """Of the sweep's record; another one means another record."""
     best_stamp: tuple[int, ...]
@@ -149,26 +153,39 @@ class Statuses:
         if record.name != sweep.name:
             # Somebody has renamed its folder: by that name it is listed and asked for.
             record = record.model_copy(update={"name": sweep.name})
-        written, trials, written_at, reached = self._trials(sweep, stamps, known)
+        alive = sweep.is_driven()
+        killed = was_killed(record, alive=alive)
+        written, trials, written_at, reached = self._trials(sweep, stamps, known, is_driven=alive, killed=killed)
         now = self._clock()
         # To read all of them is not what it takes to follow them.
         looked = Done(now, 0.0 if known is None else now - began)
         if known is not None and is_same and (known.of is trials or not known.summed_up.is_due(now, _OLDEST_STATUS_S)):
-            return replace(known, trials=trials, written=written, written_at=written_at, reached=reached, looked=looked)
+            return replace(
+                known, trials=trials, written=written, written_at=written_at, reached=reached, was_killed=killed,
+                looked=looked,
+            )  # fmt: skip
         # Before the winner is read: a later one has another stamp.
         best_stamp = sweep.best_stamp()
-        status = status_of(sweep, record, trials.records)
+        status = status_of(sweep, record, trials.records, alive=alive)
         summed_up = Done(self._clock(), self._clock() - now)
-        return Seen(status, trials, written, written_at, reached, stamp, best_stamp, looked, summed_up, of=trials)
+        return Seen(
+            status, trials, written, written_at, reached, killed, stamp, best_stamp, looked, summed_up, of=trials
+        )
 
     def _trials(
-        self, sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Seen | None
+        self,
+        sweep: Sweep,
+        stamps: Mapping[str, tuple[int, ...]],
+        known: Seen | None,
+        *,
+        is_driven: bool,
+        killed: bool,
     ) -> tuple[Trials, Trials, float, Mapping[str, Reached]]:
         """Return the trials as they were written, as they are now, when one was written, and how far they are."""
-        now, is_driven = self._clock(), sweep.is_driven()
+        now = self._clock()
         if known is None:
             written = _read(sweep, stamps, None)
-            return written, written, now, {}
+            return written, _told(written, {}, killed=killed), now, {}
         reached = known.reached if is_driven else {}
         if known.written.stamps != stamps:
             written = _read(sweep, stamps, known.written)
@@ -176,10 +193,11 @@ class Statuses:
             before = {id(record) for record in known.written.records}
             names = {record.trial_id for record in written.records if id(record) in before}
             reached = {name: each for name, each in reached.items() if name in names}
-            return written, _with(written, reached), now, reached
+            return written, _told(written, reached, killed=killed), now, reached
         if is_driven and now - known.written_at >= _SILENCE_S:
             reached = reached_by_now(sweep, known.written.records)
-        trials = known.trials if reached == known.reached else _with(known.written, reached)
+        is_same = reached == known.reached and killed == known.was_killed
+        trials = known.trials if is_same else _told(known.written, reached, killed=killed)
         return known.written, trials, known.written_at, reached
 
     def all(self) -> list[Seen]:
@@ -209,8 +227,10 @@ class Statuses:
             self._locks.pop(name, None)
 
 
-def _with(written: Trials, reached: Mapping[str, Reached]) -> Trials:
-    """Return the trials with what some of them have trained since they were written."""
+def _told(written: Trials, reached: Mapping[str, Reached], *, killed: bool) -> Trials:
+    """Return the trials with what some have trained since they were written, or as a killed process left them."""
+    if killed:
+        return replace(written, records=tuple(as_left(written.records)))
     if not reached:
         return written
     records = tuple(as_reached(record, reached.get(record.trial_id)) for record in written.records)

@@ -13,7 +13,7 @@ from policies.errors import SpecError
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import Label
 from tune_jobs.service.statuses import Seen
-from tune_jobs.sweeps.plain import to_json
+from tune_jobs.sweeps.plain import score_point, to_json
 
 
 class SweepSummary(BaseModel):
@@ -85,11 +85,17 @@ def jobs_by_sweep(jobs: Iterable[Job]) -> dict[str, Job]:
 
 
 def trial_row(record: TrialRecord, score: float | None, fields: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return a trial's record and its score, or these fields of them alone."""
+    """Return a trial's record, its score and `score_point`, or these fields of them alone."""
     if fields is None:
         row: dict[str, Any] = to_json(record)
-        return row | {"score": score}
-    return {name: score if name == "score" else to_json(getattr(record, name)) for name in fields}
+        return row | {"score": score, "score_point": score_point(record)}
+
+    def value(name: str) -> Any:
+        if name == "score":
+            return score
+        return score_point(record) if name == "score_point" else to_json(getattr(record, name))
+
+    return {name: value(name) for name in fields}
 
 
 def check_sort(name: str, records: Sequence[TrialRecord]) -> None:
@@ -115,7 +121,7 @@ def wanted_fields(text: str) -> list[str]:
     Raises:
         SpecError: It has no such field.
     """
-    known = {*TrialRecord.model_fields, "score"}
+    known = {*TrialRecord.model_fields, "score", "score_point"}
     names = text.split(",")
     for name in names:
         if name not in known:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
+
+if TYPE_CHECKING:
+    from analysis.records import TrialRecord
 
 # Derived values, so that readers of the JSON need not compute them.
 _DERIVED = ("num_episodes", "mean_return", "std_return", "solved", "optimism_gap")
@@ -31,3 +34,11 @@ def to_json(value: Any) -> Any:
     if value is None or isinstance(value, str | int):
         return value
     return [to_json(item) for item in value] if isinstance(value, Iterable) else str(value)
+
+
+def score_point(record: TrialRecord) -> dict[str, Any] | None:
+    """Return the searched values that a trial's score was reached with; None: they are its newest, as nearly always."""
+    from analysis.tables import shown_point
+
+    point = shown_point(record)
+    return None if point == record.point else to_json(point)

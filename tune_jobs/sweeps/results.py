@@ -6,7 +6,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING
 
 from analysis.notebook import BriefList, film_html, page_html, rows_html
-from analysis.points import searched_names, value_text
+from analysis.points import value_text
 from analysis.records import TrialRecord
 from analysis.selection import score_trial
 from analysis.wording import PLAIN_NONE, return_text
@@ -24,12 +24,16 @@ class Trials(BriefList[TrialRecord]):
     """The trials of a sweep, by index."""
 
     def _repr_html_(self) -> str:
-        names = searched_names(trial.point for trial in self)
+        from analysis.tables import point_names, shown_point
+
+        names = point_names(self)
         rows = []
         for trial in self:
+            # The values that the score was reached with; a population goes on with others.
+            point = shown_point(trial)
             scored = score_trial(trial)
             score = return_text(None if scored is None else scored.score, none=PLAIN_NONE)
-            values = (value_text(trial.point, name) for name in names)
+            values = (value_text(point, name) for name in names)
             rows.append([trial.trial_id, trial.status, score, f"{trial.num_env_steps:,}", *values])
         return rows_html(["trial", "status", "score", "env steps", *names], rows)
 
@@ -54,15 +58,29 @@ class Films(dict[str, Path]):
 
 @checked
 def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[TrialRecord]:
-    """Return the records of a sweep's trials, by index.
+    """Return the records of a sweep's trials, by index; those that ran when its process was killed are paused.
 
     Raises:
         NotFoundError: There is no such sweep.
     """
-    from tune_jobs.store.candidates import read_trials
     from tune_jobs.sweeps.sources import find_sweep
 
-    return Trials(read_trials(find_sweep(sweep, storage)))
+    return Trials(trials_as_left(find_sweep(sweep, storage)))
+
+
+def trials_as_left(store: Sweep) -> list[TrialRecord]:
+    """Return the records of a stored sweep's trials, as `trials` does.
+
+    Raises:
+        CheckpointError: The record of the sweep is damaged.
+    """
+    from tune_jobs.store.candidates import read_trials
+    from tune_jobs.sweeps.status import as_left, was_killed
+
+    found = read_trials(store)
+    # The lock is looked at where it matters alone.
+    runs = any(trial.status == "running" for trial in found)
+    return as_left(found) if runs and was_killed(store.read_record(), alive=store.is_driven()) else found
 
 
 @checked

@@ -20,6 +20,7 @@ from policies.errors import CheckpointError, TuneJobsError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_storage, open_sweep, resume_command
+from tune_jobs.store.transitions import paused
 from tune_jobs.sweeps.forecast import Forecast, caps_of, forecast
 from tune_jobs.sweeps.storage import storage_place
 
@@ -222,21 +223,38 @@ def _status(store: Sweep) -> SweepStatus:
     return replace(status_of(store, record, up_to_now(store, readable_trials(store))), place=store.place)
 
 
-def status_of(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> SweepStatus:
-    """Return the status of a sweep whose records have been read."""
+def was_killed(record: SweepRecord, *, alive: bool) -> bool:
+    """Whether a sweep's process was killed before it could write that it ended, and which trials it left."""
+    return record.state == "running" and not alive
+
+
+def as_left(trials: Sequence[TrialRecord]) -> list[TrialRecord]:
+    """Return the trials of a sweep whose process was killed: those that ran will continue from their checkpoints."""
+    return [paused(trial) if trial.status == "running" else trial for trial in trials]
+
+
+def status_of(
+    store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord], *, alive: bool | None = None
+) -> SweepStatus:
+    """Return the status of a sweep whose records have been read.
+
+    Args:
+        store: The sweep.
+        record: Its record.
+        trials: The records of its trials.
+        alive: Whether a process runs it now; None: it is looked for.
+    """
     if record.name != store.name:
         # Somebody has renamed or copied its folder: by that name it is listed and found.
         record = record.model_copy(update={"name": store.name})
-    alive = store.is_driven()
+    alive = store.is_driven() if alive is None else alive
+    if was_killed(record, alive=alive):
+        record, trials = record.model_copy(update={"state": "interrupted"}), as_left(trials)
     counts = Counter(trial.status for trial in trials)
-    if record.state == "running" and not alive:
-        # Its process was killed before it could write that it ended.
-        record = record.model_copy(update={"state": "interrupted"})
-        counts["paused"] += counts.pop("running", 0)
     so_far = _forecast(record, trials, alive=alive)
     return SweepStatus(
         record,
-        {name: number for name, number in counts.items() if number},
+        dict(counts),
         alive,
         num_env_steps=sum(trial.num_env_steps for trial in trials),
         max_env_steps=None if so_far is None else so_far.max_env_steps,

@@ -27,9 +27,9 @@ from tune_jobs.sweeps.current_best import has_best_to_show
 from tune_jobs.sweeps.curves import Columns, Curve
 from tune_jobs.sweeps.gathered import spec_of, sweep_data
 from tune_jobs.sweeps.numbered_nodes import NumberedNodes
-from tune_jobs.sweeps.plain import to_json
+from tune_jobs.sweeps.plain import score_point, to_json
 from tune_jobs.sweeps.shortened_paths import Shortener
-from tune_jobs.sweeps.status import SweepStatus, status_of
+from tune_jobs.sweeps.status import SweepStatus, as_left, status_of, was_killed
 from tune_jobs.sweeps.storage import folder_at
 
 FORMAT = "tune-jobs sweep"
@@ -69,6 +69,8 @@ def _document(store: Sweep) -> dict[str, Any]:
     # As status and page have them.
     trials = sorted(readable_trials(store), key=lambda trial: trial.index)
     status = status_of(store, record, trials)
+    if was_killed(record, alive=status.alive):
+        trials = as_left(trials)
     mattered = what_mattered(record, data.trials, data.results, threshold=data.threshold)
     return {
         "format": FORMAT,
@@ -114,6 +116,7 @@ def _rows(trials: Sequence[TrialRecord]) -> list[dict[str, Any]]:
             "notes": [nodes.in_text(note) for note in trial.notes],
             "error": None if trial.error is None else nodes.in_text(trial.error),
             "score": None if scored is None else to_json(scored.score),
+            "score_point": score_point(trial),
         }
         rows.append(_without(trial, _NOT_OF_TRIALS) | more)
     return rows

@@ -3,6 +3,7 @@ import { Chart, paintStrong } from "./chart.js";
 import { colour, el, setAttribute, setText } from "./dom.js";
 import { count, counted, pointText, returnText } from "./format.js";
 import { bandOf, drawLine, lineOf, valueAt } from "./lines.js";
+import { shownPoint } from "./shown_point.js";
 
 export const NUM_LEADING = 5;
 // Without the light blue, which on a dark page is too near to the blue.
@@ -110,7 +111,7 @@ export class CurvesChart extends Chart {
 }
 
 function nameOf(trial) {
-  return [trial.trial_id, pointText(trial.point)].filter(Boolean).join("  ");
+  return [trial.trial_id, pointText(shownPoint(trial))].filter(Boolean).join("  ");
 }
 
 function chosenLines(data, chosen, metric) {

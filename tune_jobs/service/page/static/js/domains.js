@@ -11,7 +11,14 @@ export const isLog = (kind) => LOG.includes(kind);
 export const kindOf = (domain) =>
   domain && typeof domain === "object" ? (Object.keys(domain).find((key) => key !== "when") ?? null) : null;
 
-const isSame = (one, other) => JSON.stringify(one) === JSON.stringify(other);
+// As the sweep file means it: one layer may be written as its number, [64] as 64.
+function meaning(value) {
+  if (!Array.isArray(value)) return value;
+  const items = value.map(meaning);
+  return items.length === 1 && typeof items[0] === "number" ? items[0] : items;
+}
+
+const isSame = (one, other) => JSON.stringify(meaning(one)) === JSON.stringify(meaning(other));
 
 // The values that a condition names: a list is several, unless the domain lists it as one value.
 function namedValues(domain, given) {

@@ -26,13 +26,16 @@ export const counted = (number, noun, plural = `${noun}s`) => `${count(number)} 
 export function significant(value, digits = 4) {
   if (!isNumber(value)) return NONE;
   if (Number.isInteger(value) && Math.abs(value) < 1e6) return String(value);
+  // As many digits of what it lacks: a gamma of 0.9904 is not 0.99, and 0.99987 is not 1.
+  if (value >= 0.9 && value < 1) {
+    const decimals = Math.max(digits, digits - 1 - Math.floor(Math.log10(1 - value)));
+    return String(Number(value.toFixed(decimals)));
+  }
   const text = value.toPrecision(digits);
   if (/e/.test(text) || Math.abs(value) < 1e-3) {
     const [mantissa, exponent] = value.toExponential(digits - 1).split("e");
     return `${Number(mantissa)}e${Number(exponent)}`;
   }
-  // 0.99987 is not 1, which fewer digits would say.
-  if (Number(text) === 1 && value < 1) return String(Number(value.toFixed(1 - Math.floor(Math.log10(1 - value)))));
   return String(Number(text));
 }
 

@@ -3,6 +3,7 @@ import { el, setAttribute, setText } from "./dom.js";
 import { Ended } from "./ended.js";
 import { FrontChart } from "./front_chart.js";
 import { count, NONE, rangeText, returnText, valueText } from "./format.js";
+import { shownPoint } from "./shown_point.js";
 
 const TOO_FEW = "Said once trials of two settings have ended.";
 const DRAWN = "Each dot is a setting, by its expected mean over seeds; none that was scored lies above the line.";
@@ -56,7 +57,7 @@ export class FrontCard {
     this.view = view;
     this.near.replaceChildren(el("b", {}, "The cheapest near the best: "), `${view.cheapest_near}.`);
     setText(this.about, view.about.join(" "));
-    const points = new Map(data.trials.map((trial) => [trial.point_index, trial.point]));
+    const points = new Map(data.trials.map((trial) => [trial.point_index, shownPoint(trial)]));
     const firstTrials = new Map(data.trials.toReversed().map((trial) => [trial.point_index, trial.trial_id]));
     this.chart ??= new FrontChart(this.drawn, { onOpen: this.onOpen });
     this.chart.show(view, { points, firstTrials });

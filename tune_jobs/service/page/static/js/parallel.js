@@ -2,6 +2,7 @@
 import { colour, el, onThemeChange, reconcile, setAttribute, setText, svg } from "./dom.js";
 import { returnText, settingText } from "./format.js";
 import { HEIGHT, makeMarks, placeAt, placeMarks, showRange, SIDE, topOf } from "./parallel_marks.js";
+import { shownPoint } from "./shown_point.js";
 
 const LEAST_AXIS_PX = 110;
 const STEP = 0.02;
@@ -300,7 +301,7 @@ export class Parallel {
     this.tip.hidden = !trial;
     this.svg.classList.toggle("can-pick", Boolean(trial));
     if (trial) {
-      const values = Object.entries(trial.point).map(([name, value]) =>
+      const values = Object.entries(shownPoint(trial)).map(([name, value]) =>
         el("span", {}, `${name} ${settingText(value)}`),
       );
       this.tip.replaceChildren(

@@ -1,5 +1,6 @@
 // The axes of parallel coordinates: where a value lies on its axis (0 below, 1 at the top), and which values a range has.
 import { returnText, settingText } from "./format.js";
+import { shownPoint } from "./shown_point.js";
 
 const NUM_TICKS = 4;
 
@@ -7,7 +8,7 @@ export function axesOf(searchedOnes, trials) {
   const axes = searchedOnes.map((searched) =>
     axisOf(
       searched,
-      trials.map((trial) => trial.point[searched.name]).filter((value) => value !== undefined && value !== null),
+      trials.map((trial) => shownPoint(trial)[searched.name]).filter((value) => value !== undefined && value !== null),
     ),
   );
   const scores = trials.map((trial) => trial.score).filter((score) => score !== null);
@@ -18,7 +19,7 @@ export function axesOf(searchedOnes, trials) {
       valueOf: (trial) => trial.score,
       text: returnText,
     });
-  return axes.map((axis) => ({ valueOf: (trial) => trial.point[axis.name] ?? null, ...axis }));
+  return axes.map((axis) => ({ valueOf: (trial) => shownPoint(trial)[axis.name] ?? null, ...axis }));
 }
 
 function axisOf({ name, kind, values }, found) {

@@ -1,6 +1,7 @@
 // What is known of one sweep: its summary, its sweep file, its trials and their curves.
 import { isLog, kindOf, LISTED, NEAR_ONE } from "./domains.js";
 import { axesOf } from "./parallel_axes.js";
+import { shownPoint } from "./shown_point.js";
 
 const FIELDS = [
   "trial_id",
@@ -9,6 +10,7 @@ const FIELDS = [
   "seed_index",
   "seed",
   "point",
+  "score_point",
   "status",
   "score",
   "training_return",
@@ -112,12 +114,13 @@ export class SweepData {
 
   findSearched() {
     const space = this.spec?.space ?? {};
-    const inPoints = new Set(this.trials.flatMap((trial) => Object.keys(trial.point)));
+    const inPoints = new Set(this.trials.flatMap((trial) => Object.keys(shownPoint(trial))));
     const names = [
       ...Object.keys(space).filter((name) => inPoints.has(name)),
       ...[...inPoints].filter((name) => !(name in space)),
     ];
-    const isNumber = (name) => this.trials.every((trial) => ["number", "undefined"].includes(typeof trial.point[name]));
+    const isNumber = (name) =>
+      this.trials.every((trial) => ["number", "undefined"].includes(typeof shownPoint(trial)[name]));
     return names.map((name) => ({ name, isNumber: isNumber(name), ...scaleOf(space[name]) }));
   }
 
@@ -136,7 +139,7 @@ export class SweepData {
   rankedPoints(trials) {
     const points = new Map();
     for (const trial of trials) {
-      const point = points.get(trial.point_index) ?? { index: trial.point_index, point: trial.point, trials: [] };
+      const point = points.get(trial.point_index) ?? { index: trial.point_index, point: shownPoint(trial), trials: [] };
       point.trials.push(trial);
       points.set(trial.point_index, point);
     }

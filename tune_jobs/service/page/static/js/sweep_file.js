@@ -76,6 +76,8 @@ const trial = is.object({
   seed_index: is.count,
   seed: is.count,
   point,
+  // The files of older versions have none.
+  score_point: maybe(point),
   hyperparams: maybe(is.mapOf(is.plain, 1000), Object.create(null)),
   engine: maybe(is.text),
   status: is.oneOf(...TRIAL_STATUSES),
@@ -212,7 +214,7 @@ function checked(value) {
   const found = document(value, "");
   const ids = new Set(found.trials.map((item) => item.trial_id));
   if (ids.size !== found.trials.length) throw new is.Unfit("trials has an id twice.");
-  const searched = new Set(found.trials.flatMap((item) => Object.keys(item.point)));
+  const searched = new Set(found.trials.flatMap((item) => Object.keys(item.score_point ?? item.point)));
   if (searched.size > MOST_HYPERPARAMS)
     throw new is.Unfit(`trials search ${searched.size} hyperparameters, and no more than ${MOST_HYPERPARAMS} are shown.`);
   return found;

@@ -1,5 +1,6 @@
 // The columns of the table of trials, which the filter and the sorting know by the same names.
 import { count, duration, NONE, returnText, settingText, valueText } from "./format.js";
+import { shownPoint } from "./shown_point.js";
 
 const collator = new Intl.Collator("en", { numeric: true });
 
@@ -12,8 +13,8 @@ export function columnsOf(searched, hasSeveralSeeds) {
       key: name,
       label: name,
       isNumber,
-      value: (row) => plain(row.point[name]),
-      text: (row) => valueText(row.point, name),
+      value: (row) => plain(shownPoint(row)[name]),
+      text: (row) => valueText(shownPoint(row), name),
     })),
     column("training_return", "training return", (row) => row.training_return, returnText, true),
     column("num_env_steps", "env steps", (row) => row.num_env_steps, count, true),

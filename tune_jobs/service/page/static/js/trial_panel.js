@@ -4,6 +4,7 @@ import { count, counted, duration, moment, returnText, settingText } from "./for
 import { drawLine, lineOf, valueAt } from "./lines.js";
 import { CheckpointLinks } from "./play_links.js";
 import { Plot, withAir } from "./plot.js";
+import { shownPoint } from "./shown_point.js";
 import { trialTone } from "./states.js";
 
 const POLL_MS = 2000;
@@ -162,7 +163,7 @@ export class TrialPanel {
     setText(this.state, trial.status);
     this.why.hidden = !trial.error;
     setText(this.why.querySelector("pre"), trial.error);
-    const values = Object.entries(trial.point).map(([name, value]) => [name, settingText(value)]);
+    const values = Object.entries(shownPoint(trial)).map(([name, value]) => [name, told(value, trial.point[name])]);
     pairs(this.point, values.length ? values : [["", "nothing is searched"]]);
     pairs(this.facts, factsOf(trial));
     this.checkpoints.show(trial);
@@ -273,6 +274,12 @@ function pairs(list, items) {
       setText(node.lastElementChild, text);
     },
   );
+}
+
+// A value that the score was reached with, and the newest, where a population has changed it since.
+function told(value, newest) {
+  const [text, now] = [settingText(value), settingText(newest)];
+  return text === now ? text : `${text} (now ${now})`;
 }
 
 function factsOf(trial) {
