@@ -149,14 +149,6 @@ class ReplayDQN(DQN):  # type: ignore[misc]
         }  # fmt: skip
         self.metrics.log_dict({name: float(value) for name, value in found.items()}, key=ENV_RUNNER_RESULTS, window=1)
 
-    def refill(self, num_env_steps: int) -> None:
-        """Sample env steps into the replay memory without learning; they count as env steps."""
-        goal = self.num_env_steps + num_env_steps
-        while self.num_env_steps < goal:
-            self._sample()
-            # In the checkpoint's statistics already, as far as a policy goes on as it did.
-            self._new_observations.clear()
-
     def _sample(self) -> int:
         """Let the env runners explore for `train_freq` env steps, and return how many they made."""
         num_runners = max(1, self.config.num_env_runners)

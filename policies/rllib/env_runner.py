@@ -34,6 +34,7 @@ from policies.envs.training_view import TrainingView
 from policies.parents import end_with_parent
 from policies.replay import NStep, Transitions
 from policies.rllib.ruined import check_outputs
+from policies.rllib.runner_errors import TellsErrors
 from policies.rllib.streams import OWN_ENDS, OWN_REWARDS, Stream, own_ends_of, own_rewards_of
 
 _WEIGHTS_SEQ_NO = "weights_seq_no"
@@ -70,7 +71,7 @@ def _is_actor() -> bool:
     return ray.is_initialized() and ray.get_runtime_context().get_actor_id() is not None
 
 
-class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
+class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
     """Samples fragments of (T, N) arrays; Box observations, flat or images, actions of the kinds that policies give.
 
     `finished_episodes` gathers (return, length) of every whole episode, over fragment boundaries, until
@@ -229,6 +230,7 @@ class ArrayEnvRunner(SingleAgentEnvRunner):  # type: ignore[misc]
         Raises:
             Exception: Whatever the environment's step raises.
         """
+        self.check_failure()
         assert self._obs is not None  # set by _reset_arrays
         assert self._just_ended is not None
         env = self.env.env

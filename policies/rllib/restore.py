@@ -80,7 +80,9 @@ def learner_weights(algorithm: Algorithm) -> dict[str, NDArray[Any]]:
     return weights
 
 
-def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = None) -> Algorithm:
+def restore_algorithm(
+    rllib_checkpoint: Path, expected: PolicyNetwork | None = None, *, max_env_runners: int | None = None
+) -> Algorithm:
     """Restore an RLlib checkpoint as an `Algorithm` that can continue training.
 
     RLlib's checkpoints are pickles: restore only what you trust. Callers check the manifest's hashes first.
@@ -89,6 +91,8 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     Args:
         rllib_checkpoint: The folder RLlib's `save_to_path` wrote.
         expected: The network that was saved beside it; the restored weights must be equal to it.
+        max_env_runners: The most env runners that there are CPUs for: what had more samples in this process. None: as
+            many as it had, for which RLlib waits without an end where there are no CPUs for them.
 
     Raises:
         CheckpointError: RLlib cannot restore it, or the weights are not the expected ones.
@@ -99,7 +103,7 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     try:
         with old_names():
             place = str(rllib_checkpoint.absolute())
-            algorithm = Algorithm.from_checkpoint(place, **_settings_of_this_machine(rllib_checkpoint))
+            algorithm = Algorithm.from_checkpoint(place, **_settings_of_this_machine(rllib_checkpoint, max_env_runners))
     except Exception as error:
         raise CheckpointError(f"RLlib cannot restore {rllib_checkpoint}: {error!r}.", _RESTORE_HINT) from error
     try:
@@ -119,14 +123,20 @@ def restore_algorithm(rllib_checkpoint: Path, expected: PolicyNetwork | None = N
     return algorithm
 
 
-def _settings_of_this_machine(rllib_checkpoint: Path) -> dict[str, Any]:
-    """Return the config to restore a checkpoint with, if it can't be the saved one as that asks for a GPU."""
-    if torch.cuda.is_available():
+def _settings_of_this_machine(rllib_checkpoint: Path, max_env_runners: int | None) -> dict[str, Any]:
+    """Return the config to restore a checkpoint with, if it can't be the saved one as that asks for what isn't here."""
+    has_gpu = torch.cuda.is_available()
+    if has_gpu and max_env_runners is None:
         return {}
     # What RLlib itself makes the Algorithm of.
     made_of = pickle.loads((rllib_checkpoint / Algorithm.CLASS_AND_CTOR_ARGS_FILE_NAME).read_bytes())  # noqa: S301
     (saved,), _ = made_of["ctor_args_and_kwargs"]
-    return {"config": {**saved, "num_gpus_per_learner": 0}} if saved["num_gpus_per_learner"] else {}
+    others = {}
+    if saved["num_gpus_per_learner"] and not has_gpu:
+        others["num_gpus_per_learner"] = 0
+    if max_env_runners is not None and saved["num_env_runners"] > max_env_runners:
+        others["num_env_runners"] = 0
+    return {"config": {**saved, **others}} if others else {}
 
 
 def take_over_state(algorithm: Algorithm, rllib_checkpoint: Path, expected: PolicyNetwork) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from packed_dqn import SMALL, q_values_of
 from packed_rllib import MODULE, learner_of, state_of
-from trials import make_task
+from trials import fill_replay, make_task
 
 from policies.acting.policy import NetworkPolicy
 from policies.packed.dqn.stack import DQNStack
@@ -188,7 +188,7 @@ def test_a_checkpoint_is_an_rllib_algorithm_that_trains_on(trained: Trained) -> 
     q_values = q_values_of(algorithm.get_module(MODULE), rows)
     np.testing.assert_array_equal(NetworkPolicy(policy).act(rows), q_values.argmax(axis=1))
 
-    algorithm.refill(32)
+    fill_replay(algorithm, 32)
     assert_same_arrays(state_of(learner)[0], saved.weights)
     result = algorithm.train()
     steps = result["env_runners"]["num_env_steps_sampled_lifetime"]

@@ -166,6 +166,50 @@ def test_a_checkpoint_that_was_trained_on_a_gpu_is_restored_where_there_is_none(
     algo.stop()
 
 
+def test_a_checkpoint_of_more_env_runners_than_cpus_is_restored_without_them(checkpoint: Path) -> None:
+    """RLlib would wait for their CPUs without an end."""
+    from tune_jobs.training.rllib import algorithm_from_checkpoint
+
+    file = checkpoint / "rllib" / "class_and_ctor_args.pkl"
+    made_of = pickle.loads(file.read_bytes())
+    made_of["ctor_args_and_kwargs"][0][0]["num_env_runners"] = 64
+    file.write_bytes(pickle.dumps(made_of))
+    algo = algorithm_from_checkpoint(checkpoint)
+    assert algo.config.num_env_runners == 0
+    assert algo.train()["training_iteration"] == 3
+    algo.stop()
+
+
+@pytest.mark.parametrize(("num_cpus", "num_left"), [(2.0, 1), (1.0, 0)])
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_env_runners_are_restored_where_there_are_cpus_for_them_and_for_one_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: str, num_cpus: float, num_left: int
+) -> None:
+    from tune_jobs.training.rllib import RLlibEngine, algorithm_from_checkpoint
+
+    engine = RLlibEngine()
+    engine.build(make_task(tmp_path, algorithm, num_env_runners=1), None)
+    engine.train_iteration()
+    engine.save(tmp_path)
+    save_policy(engine.policy(), tmp_path)
+    engine.close()
+    monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": num_cpus})
+    algo = algorithm_from_checkpoint(tmp_path)
+    assert (algo.config.num_env_runners, algo.env_runner_group.num_remote_env_runners()) == (num_left, num_left)
+    assert algo.train()["training_iteration"] == 2
+    algo.stop()
+
+
+def test_a_process_that_has_joined_no_ray_counts_its_own_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tune_jobs.training import rllib
+
+    monkeypatch.setattr("ray.cluster_resources", lambda: {"CPU": 5.0})
+    assert rllib._num_cpus() == 5
+    monkeypatch.setattr("ray.is_initialized", lambda: False)
+    monkeypatch.setattr(rllib, "usable_cpus", lambda: 3.0)
+    assert rllib._num_cpus() == 3
+
+
 def test_a_trial_with_a_gpu_is_not_restored_on_the_cpu(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from trials import make_task
+from trials import fill_replay, make_task
 
+from analysis.records import ChangeRecord
 from policies.portable.file import save_policy
 from tune_jobs.training.protocol import TrialTask
 
@@ -134,23 +135,62 @@ def test_one_that_has_not_learnt_waits_no_second_time(tmp_path: Path, engine: st
 @BOTH
 def test_a_memory_that_was_filled_by_hand_is_learnt_from_at_once(tmp_path: Path, engine: str) -> None:
     algorithm = restored(checkpoint_of(task_of(tmp_path), engine, 3), engine)
-    algorithm.refill(STARTS)
+    fill_replay(algorithm, STARTS)
     seen = watch_updates(algorithm)
     algorithm.train()
     assert seen[0][0] in (4, 5)
     algorithm.stop()
 
 
-def test_a_trial_that_goes_on_learns_in_the_first_phase_of_its_next_iteration(tmp_path: Path) -> None:
+def test_a_trial_that_goes_on_fills_its_memory_in_ordinary_iterations(tmp_path: Path) -> None:
+    """Each has its limit of time, and stop rules are looked at after each."""
     from tune_jobs.training.rllib import RLlibEngine
 
     task = task_of(tmp_path, normalize_observations=True)
     folder = checkpoint_of(task, "rllib", 3)
     engine = RLlibEngine()
     engine.build(task, folder)
-    count = weights_of(engine.algorithm)["obs_count"]
-    seen, steps = watch_updates(engine.algorithm), engine.algorithm.num_env_steps
+    before, steps = weights_of(engine.algorithm), engine.algorithm.num_env_steps
+    # Of three iterations, as the checkpoint has it.
+    assert 3 * PER_ITERATION <= steps < 3 * (PER_ITERATION + 5)
+    assert len(engine.algorithm.replay) == 0
+    seen = watch_updates(engine.algorithm)
+    assert PER_ITERATION <= engine.train_iteration().num_env_steps - steps < PER_ITERATION + 5
+    assert seen == []
+    for name, value in weights_of(engine.algorithm).items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
     engine.train_iteration()
-    assert seen[0][0] in (4, 5)
-    assert weights_of(engine.algorithm)["obs_count"] - count == engine.algorithm.num_env_steps - steps
+    assert STARTS <= seen[0][0] < STARTS + 5
+    # The statistics, too, are learnt from those env steps alone that come after.
+    learnt = weights_of(engine.algorithm)["obs_count"] - before["obs_count"]
+    assert 0 < learnt <= engine.algorithm.num_env_steps - steps - STARTS + 5
+    engine.close()
+
+
+def test_however_large_its_memory_was_a_trial_is_built_without_an_env_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They would be one iteration of 20,000 env steps: of slow environments, hours."""
+    from policies.rllib.env_runner import ArrayEnvRunner
+    from tune_jobs.training.rllib import RLlibEngine
+
+    folder = checkpoint_of(task_of(tmp_path), "rllib", 3)
+    sampled: list[int] = []
+    sample = ArrayEnvRunner.sample_transitions
+
+    def spied(self: Any, num_timesteps: int, **values: Any) -> Any:
+        sampled.append(num_timesteps)
+        assert len(sampled) < 2 * PER_ITERATION
+        return sample(self, num_timesteps, **values)
+
+    monkeypatch.setattr(ArrayEnvRunner, "sample_transitions", spied)
+    # Among what a population may change; of a trial that is resumed it is as it was.
+    change = ChangeRecord(
+        iteration=3, num_env_steps=120, source_trial_id="t0009", source_iteration=3, before={}, after={}, time=0.0
+    )
+    engine = RLlibEngine()
+    engine.build(task_of(tmp_path, learning_starts=20_000, changes=(change,), num_env_steps=120), folder)
+    assert sampled == []
+    assert 120 + PER_ITERATION <= engine.train_iteration().num_env_steps < 120 + PER_ITERATION + 5
+    assert sampled
     engine.close()

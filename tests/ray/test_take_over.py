@@ -128,7 +128,7 @@ def test_the_trials_own_counts_go_on_and_do_so_again_after_a_restore(tmp_path: P
     source.close()
     engine, task = taken_over(folder, task, lr=0.02)
     stats = engine.train_iteration()
-    # An iteration; with DQN the env steps that refill the replay memory too.
+    # An iteration; with DQN its first env steps refill the replay memory.
     assert 200 < stats.num_env_steps < 200 + 128 + 64
     assert engine.policy().training["iteration"] == 3
     own = tmp_path / "000003-own"

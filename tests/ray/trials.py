@@ -59,6 +59,14 @@ def run_trial(task: TrialTask, engine: TrainingEngine) -> Progress:
     return progress
 
 
+def fill_replay(algorithm: Any, num_env_steps: int) -> None:
+    """Let a DQN Algorithm sample without learning, of weights or statistics."""
+    goal = algorithm.num_env_steps + num_env_steps
+    while algorithm.num_env_steps < goal:
+        algorithm._sample()
+        algorithm._new_observations.clear()
+
+
 def train_pack(tasks: Sequence[TrialTask], folder: Path, num_iterations: int) -> list[Policy]:
     """Train trials as one pack, none of which may fail, and return their policies, each read from its file."""
     from tune_jobs.training.packed import PackedEngine

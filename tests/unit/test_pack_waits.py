@@ -1,4 +1,4 @@
-"""What a member of a pack has of its wait for others: none of the seconds that `stop` limits, and what its log says of new episodes."""
+"""What a pack's member has of its wait for others: none of the seconds that `stop` limits; and what its log says then."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence

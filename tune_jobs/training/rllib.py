@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import ray
 import torch
 from ray.rllib.algorithms.algorithm import Algorithm as RLlibAlgorithm
 from ray.rllib.core import DEFAULT_MODULE_ID
@@ -20,6 +21,7 @@ from policies.rllib.dqn_algorithm import ReplayDQN
 from policies.rllib.env_runner import ArrayEnvRunner
 from policies.rllib.restore import portable_policy, restore_algorithm, take_over_state
 from policies.rllib.runner_errors import as_raised_there
+from tune_jobs.plan.machine import usable_cpus
 from tune_jobs.training.devices import device_for
 from tune_jobs.training.env_runner import EnvRunner
 from tune_jobs.training.protocol import IterationStats, TrialTask
@@ -42,8 +44,19 @@ _LEARNER_STATS = {
 
 
 def algorithm_from_checkpoint(checkpoint: Path) -> RLlibAlgorithm:
-    """Restore a checkpoint of this engine as an RLlib Algorithm that can continue training."""
-    return restore_algorithm(checkpoint / RLLIB_FOLDER, read_policy(checkpoint).network)
+    """Restore a checkpoint of this engine as an RLlib Algorithm that can continue training.
+
+    With more env runners than there are CPUs for, beside one for this process, it samples in this process.
+    """
+    max_env_runners = max(0, int(_num_cpus()) - 1)
+    return restore_algorithm(
+        checkpoint / RLLIB_FOLDER, read_policy(checkpoint).network, max_env_runners=max_env_runners
+    )
+
+
+def _num_cpus() -> float:
+    """Return the CPUs of the Ray that this process has joined, or of this machine, where RLlib will start one."""
+    return float(ray.cluster_resources().get("CPU", 0.0)) if ray.is_initialized() else usable_cpus()
 
 
 class RLlibEngine:
@@ -117,9 +130,10 @@ class RLlibEngine:
         return int(algorithm.metrics.peek(_LIFETIME_STEPS, default=0))
 
     def _continue_streams(self, checkpoint: Path) -> None:
-        """Use new random numbers after a restore, and fill the replay memory.
+        """Use new random numbers after a restore: RLlib saves no state of the random generators (2.60).
 
-        RLlib saves no state of the random generators (2.60), and the replay memory is not in checkpoints.
+        The replay memory is not in checkpoints, and begins empty. The next iterations fill it: all at once, slow
+        environments would take longer than an iteration may.
         """
         assert self._task is not None
         iteration = int(checkpoint.name) if checkpoint.name.isdigit() else 0
@@ -133,10 +147,6 @@ class RLlibEngine:
         self.algorithm.env_runner_group.foreach_env_runner(reseed)
         if isinstance(self._hyperparams, DQNHyperparams):
             self.algorithm.seed_replay(own)
-            # It gets as many transitions as it had when learning began; without replay, the next steps fill it.
-            num_steps = max(self._hyperparams.learning_starts, self._hyperparams.train_batch_size)
-            if self._hyperparams.replay != "none" and self.algorithm.num_updates:
-                self.algorithm.refill(num_steps)
 
     @as_raised_there()
     def train_iteration(self) -> IterationStats:
