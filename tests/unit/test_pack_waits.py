@@ -1,4 +1,4 @@
-"""What a pack's member has of its wait for others: none of the seconds that `stop` limits; and what its log says then."""
+"""A member that waits in its pack: none of those seconds count for `stop`; and what its log says then."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
