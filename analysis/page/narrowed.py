@@ -29,7 +29,12 @@ def narrowed_space(space: Mapping[str, Any], points: Sequence[Mapping[str, Any]]
     narrowed = {
         name: _narrowed(domain, [point[name] for point in points if name in point]) for name, domain in space.items()
     }
-    return _with_possible_conditions(narrowed)
+    # As the space itself reads them: [32, 64] is one value if it lists that, which the narrowed one may not.
+    named = {
+        name: {other: _listed(given, space.get(other)) for other, given in conditions_of(domain).items()}
+        for name, domain in space.items()
+    }
+    return _with_possible_conditions(narrowed, named)
 
 
 def _narrowed(domain: Any, values: Sequence[Any]) -> Any:
@@ -45,19 +50,25 @@ def _narrowed(domain: Any, values: Sequence[Any]) -> Any:
     return {**domain, kind: _range(kind, ends, values)}
 
 
-def _with_possible_conditions(space: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a space without conditions on values that it does not have any more, and without what could never act."""
+def _with_possible_conditions(
+    space: Mapping[str, Any], named: Mapping[str, Mapping[str, Sequence[Any]]]
+) -> dict[str, Any]:
+    """Return a space without conditions on values that it does not have any more, and without what could never act.
+
+    Args:
+        space: The domains.
+        named: The values that the conditions of each name, by the names that these are on.
+    """
     found: dict[str, Any] = {}
     for name, domain in space.items():
         conditions = {
-            other: [value for value in _listed(given, space.get(other)) if _has(space.get(other), value)]
-            for other, given in conditions_of(domain).items()
+            other: [value for value in values if _has(space.get(other), value)] for other, values in named[name].items()
         }
         if all(conditions.values()):
             kept = {other: values[0] if len(values) == 1 else values for other, values in conditions.items()}
             found[name] = {**domain, CONDITION: kept} if conditions else domain
     # What depended on something that is gone is gone too.
-    return found if len(found) == len(space) else _with_possible_conditions(found)
+    return found if len(found) == len(space) else _with_possible_conditions(found, named)
 
 
 def _listed(given: Any, domain: Any) -> list[Any]:

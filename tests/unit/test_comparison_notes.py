@@ -96,3 +96,25 @@ def test_what_a_model_chooses_is_told_by_what_it_may_choose() -> None:
     batches = {**LR, "train_batch_size": {"choice": [1_000, 30_000]}}
     (note,) = notes("asha", 1, space=batches, hyperparams={"minibatch_size": 100}, num_samples=12, search="gp")
     assert "30,000 env steps apart: 1 time" in note
+
+
+def refills(scheduler: Any, **hyperparams: Any) -> list[str]:
+    """What the plan says of a sweep of DQN, whose populations are compared each 6,000 env steps."""
+    sweep = {
+        "env": "CartPole-v1", "algorithm": "dqn", "space": LR, "num_samples": 8, "hyperparams": hyperparams,
+        "stop": {"num_env_steps": 60_000}, "scheduler": scheduler,
+    }  # fmt: skip
+    return [note for note in make_plan(load_spec(sweep), Machine(2)).notes if "replay memory" in note]
+
+
+@pytest.mark.parametrize("scheduler", ["pbt", "pb2", {"type": "pbt", "perturb_every_env_steps": 6_000}])
+def test_replay_memories_that_are_filled_for_a_whole_interval_are_told(scheduler: Any) -> None:
+    (note,) = refills(scheduler, learning_starts=6_000)
+    assert "for 6,000 env steps before it learns on" in note
+    assert "compared every 6,000" in note
+    assert refills(scheduler, learning_starts=5_999) == []
+
+
+def test_nothing_is_said_of_memories_where_nothing_is_filled_again() -> None:
+    assert refills("pbt", learning_starts=6_000, replay="none", train_batch_size=32) == []
+    assert refills("asha", learning_starts=6_000) == []

@@ -198,14 +198,25 @@ def test_a_narrower_space_drops_what_could_never_act_in_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "named"),
-    [([1000.0, 2000.0], 2000), ([1000, 2000], 2e3), ([[64], [64, 64]], 64), ([64, [64, 64]], [64])],
+    ("values", "named", "place"),
+    [([1000.0, 2000.0], 2000, 1), ([1000, 2000], 2e3, 1), ([[64], [64, 64]], 64, 0), ([64, [64, 64]], [64], 0)],
 )
-def test_a_condition_may_write_a_value_in_another_form_than_the_list(values: list[Any], named: Any) -> None:
+def test_a_condition_may_write_a_value_in_another_form_than_the_list(values: list[Any], named: Any, place: int) -> None:
     space = {"x": {"choice": values}, "n_step": {"choice": [1, 2], "when": {"x": named}}}
     points = [{"x": value, "n_step": 1} for value in values]
     assert narrowed_space(space, points) == {"x": {"choice": values}, "n_step": {"choice": [1], "when": {"x": named}}}
-    assert narrowed_space(space, [{"x": named, "n_step": 1}])["x"]["choice"] in ([values[0]], [values[1]])
+    narrowed = narrowed_space(space, [{"x": named, "n_step": 1}])
+    assert narrowed == {"x": {"choice": [values[place]]}, "n_step": {"choice": [1], "when": {"x": named}}}
+
+
+@pytest.mark.parametrize(
+    ("values", "named"), [([[64], [64, 64]], [64, 64]), ([[64], [32, 64]], [32, 64]), ([64, [32, 64]], [32, 64])]
+)
+def test_a_condition_on_a_list_that_is_gone_is_none_on_the_numbers_in_it(values: list[Any], named: list[int]) -> None:
+    space = {"x": {"choice": values}, "n_step": {"choice": [1, 2], "when": {"x": named}}}
+    assert narrowed_space(space, [{"x": values[0]}]) == {"x": {"choice": values[:1]}}
+    kept = {"x": {"choice": values[1:]}, "n_step": {"choice": [1], "when": {"x": named}}}
+    assert narrowed_space(space, [{"x": values[1], "n_step": 1}]) == kept
 
 
 LAYERS = {"layers": {"number": [1, 2], "sizes": {"choice": [8]}}}

@@ -1,5 +1,6 @@
 """What is told of a sweep whose process was killed: its trials that ran are paused, wherever they are told of."""
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from tune_jobs.service.derived import Derived
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.store.opening import open_storage
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.drawing import ReportMatter
+from tune_jobs.sweeps.exports import trials_csv
 from tune_jobs.sweeps.sweep_file import _document
 
 
@@ -44,6 +47,8 @@ def test_trials_are_told_as_they_are_counted(store: SweepStore) -> None:
     document = _document(store)
     assert document["status"]["counts"] == counts
     assert {row["trial_id"]: row["status"] for row in document["trials"]} == EXPECTED
+    assert {row["trial_id"]: row["status"] for row in csv.DictReader(trials_csv(store).splitlines())} == EXPECTED
+    assert statuses_of(ReportMatter.read(store, None, None).trials) == EXPECTED
     made = Derived(open_storage(storage), Statuses(open_storage(storage)))
     assert {row["trial_id"]: row["status"] for row in json.loads(made.records("mine"))} == EXPECTED
 

@@ -159,7 +159,9 @@ def told_here(error: SpecError, source: str, overrides: Sequence[str]) -> SpecEr
 
 
 def _is_folder(output: str) -> bool:
-    return output.endswith("/") or Path(output).is_dir()
+    from tune_jobs.sweeps.storage import local_path
+
+    return output.endswith("/") or local_path(output).is_dir()
 
 
 def _target(output: str | None, default: str) -> Path:

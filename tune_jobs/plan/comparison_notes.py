@@ -1,4 +1,4 @@
-"""The note of a plan on a scheduler that can't compare trials as often as it asks for.
+"""The notes of a plan on a scheduler that can't compare trials as often as it asks for, or that lets none learn.
 
 Trials are compared at their evaluations alone (decision 6): with one evaluation, at its end, no trial is ever ended
 early or goes on from a copy.
@@ -7,12 +7,12 @@ early or goes on from a copy.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analysis.wording import counted
-from policies.hyperparams import Hyperparams, PPOHyperparams
+from policies.hyperparams import DQNHyperparams, Hyperparams, PPOHyperparams
 from tune_jobs.plan.estimates import iteration_env_steps, planned_env_steps
 
 if TYPE_CHECKING:
@@ -39,17 +39,21 @@ class _Comparisons:
 
 
 def comparison_notes(spec: SweepSpec, trials: Iterable[tuple[SweepSpec, Hyperparams]]) -> list[str]:
-    """Return the note on evaluations that are too rare for the scheduler, or none.
+    """Return the notes on evaluations that are too rare for the scheduler, and on intervals too short to learn in.
 
     Args:
         spec: The sweep.
         trials: For each point the sweep as it is for its trials, and hyperparameters that these may have: they say
             how long a trial is, and how far apart its evaluations are.
     """
-    kind, every = spec.scheduler.type, spec.evaluation.every_iterations
-    if kind == "none":
+    if spec.scheduler.type == "none":
         return []
     known = list(trials)
+    return [*_late_notes(spec, known), *_refill_notes(spec, known)]
+
+
+def _late_notes(spec: SweepSpec, known: Sequence[tuple[SweepSpec, Hyperparams]]) -> list[str]:
+    kind, every = spec.scheduler.type, spec.evaluation.every_iterations
     # Of thousands of trials few differ in these.
     cases = {(every * iteration_env_steps(values), planned_env_steps(own, values)) for own, values in known}
     found = [_comparisons(spec, interval, end) for interval, end in cases]
@@ -68,6 +72,23 @@ def comparison_notes(spec: SweepSpec, trials: Iterable[tuple[SweepSpec, Hyperpar
     text = (
         f"{kind} is to compare each trial {wanted} before its end at {worst.end:,} env steps, but evaluations, where "
         f"it does so, are {worst.interval:,} env steps apart: {times}. Lower {lower}."
+    )
+    return [text]
+
+
+def _refill_notes(spec: SweepSpec, known: Sequence[tuple[SweepSpec, Hyperparams]]) -> list[str]:
+    """Return the note on a population whose trials fill their replay memories for as long as an interval, or none."""
+    if not spec.scheduler.is_population:
+        return []
+    every = spec.perturb_every_env_steps
+    replayed = [values for _, values in known if isinstance(values, DQNHyperparams) and values.replay != "none"]
+    longest = max((max(values.learning_starts, values.train_batch_size) for values in replayed), default=0)
+    if longest < every:
+        return []
+    text = (
+        "A trial that goes on from a copy, or that gave its place away to others, fills its replay memory for "
+        f"{longest:,} env steps before it learns on (learning_starts), and trials are compared every {every:,}: it may "
+        "learn nothing between two comparisons. Lower learning_starts, or raise scheduler.perturb_every_env_steps."
     )
     return [text]
 

@@ -20,8 +20,9 @@ from analysis.best_records import BestRecord, SettingsRecord
 from analysis.records import IterationRecord, SweepRecord, TrialRecord
 from policies.errors import TuneJobsError
 from tune_jobs.spec.file import stored_spec
-from tune_jobs.store.candidates import read_results, read_trials
+from tune_jobs.store.candidates import read_results
 from tune_jobs.store.contract import Sweep
+from tune_jobs.sweeps.results import trials_as_left
 from tune_jobs.sweeps.settings import judged
 
 _DRAWN_WITH = (
@@ -61,7 +62,7 @@ class ReportMatter:
         from analysis.report_data import goal_of
 
         with store.reading():
-            record, trials, results = store.read_record(), read_trials(store), read_results(store)
+            record, trials, results = store.read_record(), trials_as_left(store), read_results(store)
         threshold = goal_of(record, None) if best is None else best.confirmation.threshold
         settings = judged(stored_spec(record), trials, results, threshold)
         return cls(store.place, record, trials, results, best, settings, why_no_best)

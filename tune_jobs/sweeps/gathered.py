@@ -20,7 +20,8 @@ def sweep_data(store: Sweep) -> SweepData:
         CheckpointError: The record of the sweep or of a trial is damaged.
     """
     from analysis.report_data import goal_of
-    from tune_jobs.store.candidates import read_results, read_trials
+    from tune_jobs.store.candidates import read_results
+    from tune_jobs.sweeps.results import trials_as_left
 
     best: BestRecord | None = None
     try:
@@ -30,7 +31,7 @@ def sweep_data(store: Sweep) -> SweepData:
         best = None
     spec = spec_of(store)
     return SweepData(
-        trials=read_trials(store),
+        trials=trials_as_left(store),
         results=read_results(store),
         objective=spec.objective.type,
         num_env_steps=spec.stop.num_env_steps,
