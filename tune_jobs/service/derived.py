@@ -147,7 +147,7 @@ class Derived:
         Raises:
             NotFoundError: There is no such sweep, or it is damaged.
         """
-        from tune_jobs.sweeps.results import trials_as_left
+        from tune_jobs.sweeps.status import trials_as_left
 
         def records_of(sweep: Sweep) -> bytes:
             return b"[%s]" % b",".join(record.model_dump_json().encode() for record in trials_as_left(sweep))

@@ -22,8 +22,8 @@ from policies.errors import TuneJobsError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.candidates import read_results
 from tune_jobs.store.contract import Sweep
-from tune_jobs.sweeps.results import trials_as_left
 from tune_jobs.sweeps.settings import judged
+from tune_jobs.sweeps.status import trials_as_left
 
 _DRAWN_WITH = (
     "jinja2", "matplotlib.figure", "matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf",

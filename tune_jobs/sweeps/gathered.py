@@ -21,7 +21,7 @@ def sweep_data(store: Sweep) -> SweepData:
     """
     from analysis.report_data import goal_of
     from tune_jobs.store.candidates import read_results
-    from tune_jobs.sweeps.results import trials_as_left
+    from tune_jobs.sweeps.status import trials_as_left
 
     best: BestRecord | None = None
     try:

@@ -64,23 +64,9 @@ def trials(sweep: str | Path, *, storage: str | Path | None = None) -> list[Tria
         NotFoundError: There is no such sweep.
     """
     from tune_jobs.sweeps.sources import find_sweep
+    from tune_jobs.sweeps.status import trials_as_left
 
     return Trials(trials_as_left(find_sweep(sweep, storage)))
-
-
-def trials_as_left(store: Sweep) -> list[TrialRecord]:
-    """Return the records of a stored sweep's trials, as `trials` does.
-
-    Raises:
-        CheckpointError: The record of the sweep is damaged.
-    """
-    from tune_jobs.store.candidates import read_trials
-    from tune_jobs.sweeps.status import as_left, was_killed
-
-    found = read_trials(store)
-    # The lock is looked at where it matters alone.
-    runs = any(trial.status == "running" for trial in found)
-    return as_left(found) if runs and was_killed(store.read_record(), alive=store.is_driven()) else found
 
 
 @checked

@@ -233,6 +233,20 @@ def as_left(trials: Sequence[TrialRecord]) -> list[TrialRecord]:
     return [paused(trial) if trial.status == "running" else trial for trial in trials]
 
 
+def trials_as_left(store: Sweep) -> list[TrialRecord]:
+    """Return the records of a stored sweep's trials, as `trials` does.
+
+    Raises:
+        CheckpointError: The record of the sweep is damaged.
+    """
+    from tune_jobs.store.candidates import read_trials
+
+    found = read_trials(store)
+    # The lock is looked at where it matters alone.
+    runs = any(trial.status == "running" for trial in found)
+    return as_left(found) if runs and was_killed(store.read_record(), alive=store.is_driven()) else found
+
+
 def status_of(
     store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord], *, alive: bool | None = None
 ) -> SweepStatus:
