@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from rllib_engines import engine
 from trials import TRIAL_SEED, make_task, run_trial
 
 from policies.errors import CannotRunError, CheckpointError, NonFiniteWeightsError, NotFoundError
@@ -24,14 +25,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
-
-@pytest.fixture
-def engine() -> Iterator[RLlibEngine]:
-    from tune_jobs.training.rllib import RLlibEngine
-
-    engine = RLlibEngine()
-    yield engine
-    engine.close()
+__all__ = ["engine"]
 
 
 def weights_after(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import pytest
 import torch
 from ray import cloudpickle
 from ray.exceptions import RayTaskError
+from rllib_engines import engine
 from trials import TRIAL_SEED, make_task, run_trial
 
 from policies.errors import EnvFailedError, NonFiniteWeightsError
@@ -22,14 +22,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
-
-@pytest.fixture
-def engine() -> Iterator[RLlibEngine]:
-    from tune_jobs.training.rllib import RLlibEngine
-
-    engine = RLlibEngine()
-    yield engine
-    engine.close()
+__all__ = ["engine"]
 
 
 def troubled(folder: Path, algorithm: str, num_env_runners: int) -> TrialTask:
