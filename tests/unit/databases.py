@@ -67,10 +67,14 @@ class PostgreSQL:
     def kill(self) -> None:
         """End the server as by a crash."""
         assert self._server is not None
+        children = Path(f"/proc/{self._server.pid}/task/{self._server.pid}/children").read_text().split()
         self._server.kill()
         self._server.wait()
-        # Its children end as they see that it is gone; a new one would refuse to begin before.
-        time.sleep(0.5)
+        # They end as they see that it is gone; a new one would refuse to begin before.
+        deadline = time.monotonic() + 60
+        while any(_lives(pid) for pid in children):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
 
     def stop(self) -> None:
         """End it, and remove its folder."""
@@ -85,6 +89,14 @@ class PostgreSQL:
         name = f"test{self._count}"
         self._run("createdb", "-h", str(self.folder), "-U", "postgres", name)
         return f"postgresql://postgres@/{name}?host={self.folder}"
+
+
+def _lives(pid: str) -> bool:
+    """Whether a process is there and has not ended: of one that nobody has waited for yet, the command is empty."""
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())
+    except OSError:
+        return False
 
 
 def started_or_skip() -> PostgreSQL:

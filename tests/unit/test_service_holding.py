@@ -166,14 +166,39 @@ class TestPostgreSQL:
         monkeypatch.setattr(module, "Supervisor", fake)
         with opened(config(tmp_path / "a", server.new_database())) as service:
             make_sweep_folder(tmp_path / "a" / "mine")
+            refusals = refused_checks(monkeypatch)
             other = overtaken(service)
+
+            def refused_once_more() -> None:
+                before = len(refusals)
+                service.supervisor.wake()
+                wait_until(lambda: len(refusals) > before)
+
+            # A look that began before the database was lost may still go on.
+            refused_once_more()
             job = service.queue.begin("mine", "drive", {}, owner="ann", num_cpus=1.0)[0]
-            service.supervisor.wake()
+            refused_once_more()
             wait_until(lambda: f"The queue can't be looked at: {TAKEN}" in caplog.text)
             assert service.queue.job(job.id).state == "waiting"
             assert service.supervisor.is_alive
             other.close()
             wait_until(lambda: service.queue.job(job.id).outcome == "completed")
+
+
+def refused_checks(monkeypatch: pytest.MonkeyPatch) -> list[Hold]:
+    """Who checked from now on and found another one's hold; as `overtaken` does too until it has it."""
+    refused: list[Hold] = []
+    check = Hold.check
+
+    def noted(hold: Hold) -> None:
+        try:
+            check(hold)
+        except CannotRunError:
+            refused.append(hold)
+            raise
+
+    monkeypatch.setattr(Hold, "check", noted)
+    return refused
 
 
 def overtaken(service: Service) -> Hold:
