@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.points import EMPTY, lacks
 from analysis.records import TrialRecord
-from analysis.tables import cell_value, point_names
+from analysis.tables import cell_value, point_names, shown_point
 from analysis.wording import is_number
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
     One that doesn't act in some trials is none, nor one that is null or a list in some, as these would have no place on
     it. Trials whose points are not chosen yet don't count.
     """
-    points = [trial.point for trial in trials if trial.point]
+    points = [point for trial in trials if (point := shown_point(trial))]
     names = []
     for name in point_names(trials):
         values = [point.get(name) for point in points]
@@ -111,9 +111,9 @@ def numeric_names(trials: Sequence[TrialRecord]) -> list[str]:
 
 def group_names(trials: Sequence[TrialRecord], axis: str | None) -> list[str]:
     """Return up to two searched hyperparameters that group trials: they have few values and are not the axis."""
-    names = []
+    names, points = [], [shown_point(trial) for trial in trials]
     for name in point_names(trials):
-        values = {cell_value(trial.point.get(name)) for trial in trials}
+        values = {cell_value(point.get(name)) for point in points}
         if name != axis and 1 < len(values) <= _MAX_GROUP_VALUES:
             names.append(name)
     return names[:2]
@@ -126,11 +126,13 @@ def _value(point: Mapping[str, Any], name: str) -> Any:
 def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[str, Style]:
     """Return a style for each trial id: colour by combination of values, marker by the first, line by the last.
 
-    Without names all trials share one style with an empty label.
+    Without names all trials share one style with an empty label. In a population the values are those that the score
+    was reached with.
     """
     if not names:
         return {trial.trial_id: Style("", PALETTE[0], MARKERS[0], LINES[0]) for trial in trials}
-    keys = {t.trial_id: tuple(_value(t.point, name) for name in names) for t in trials}
+    points = {trial.trial_id: shown_point(trial) for trial in trials}
+    keys = {trial_id: tuple(_value(point, name) for name in names) for trial_id, point in points.items()}
     first = list(dict.fromkeys(key[0] for key in keys.values()))
     last = list(dict.fromkeys(key[-1] for key in keys.values()))
     styles = {

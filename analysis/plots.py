@@ -32,6 +32,7 @@ from analysis.plot_style import (
 )
 from analysis.records import IterationRecord, TrialRecord
 from analysis.selection import score_trial
+from analysis.tables import shown_point
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -286,10 +287,11 @@ def _draw_winner(
 def _positions(trials: Sequence[TrialRecord], name: str | None, styles: Mapping[str, Style]) -> dict[str, float]:
     """Return each trial's position on the horizontal axis: its value, or the number of its group.
 
-    A trial whose value is no finite number has none.
+    A trial whose value is no finite number has none. In a population it is the value that the score was reached with.
     """
     if name is not None:
-        return {trial.trial_id: float(trial.point[name]) for trial in trials if has_place(trial.point.get(name))}
+        points = {trial.trial_id: shown_point(trial) for trial in trials}
+        return {trial_id: float(point[name]) for trial_id, point in points.items() if has_place(point.get(name))}
     labels = list(dict.fromkeys(style.label for style in styles.values()))
     positions = {}
     for i, label in enumerate(labels):

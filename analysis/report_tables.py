@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 from analysis.best_records import BestRecord
 from analysis.points import EMPTY, lacks
-from analysis.records import IterationRecord, TrialRecord
+from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.selection import rank_points
-from analysis.tables import groups_frame, point_names, shown_point, steps_to_solve_frame, trials_frame
+from analysis.tables import groups_frame, point_names, points_of, shown_point, steps_to_solve_frame, trials_frame
 from analysis.wording import NONE, is_number, number, return_text
 
 MAX_STEPS_ROWS = 20
@@ -133,10 +133,15 @@ def steps_table(
     frame = steps_to_solve_frame(trials, results, threshold=goal)
     names = point_names(trials)
     lacking = _lacking(trials, names)
-    seeds = [str(name) for name in frame.columns if str(name).startswith("num_env_steps_seed_")]
+    seeds: dict[int, list[TrialRecord]] = {}
+    for trial in sorted(trials, key=lambda trial: trial.seed_index):
+        seeds.setdefault(trial.point_index, []).append(trial)
     rows = []
     for row in frame[frame["num_solved"] > 0].head(MAX_STEPS_ROWS).to_dict("records"):
-        each = ", ".join("not solved" if (cell := _cell("", row[name])).value is None else cell.text for name in seeds)
+        # The frame has a column for each seed of any point; this one may have been given fewer.
+        each = ", ".join(
+            _steps_of_seed(row[f"num_env_steps_seed_{trial.seed_index}"], trial) for trial in seeds[row["point_index"]]
+        )
         rows.append(
             [
                 *(_cell(name, row[name], is_empty=name in lacking) for name in names),
@@ -151,9 +156,18 @@ def steps_table(
 _NOTHING = Cell(None, EMPTY)
 
 
+def _steps_of_seed(num_env_steps: Any, trial: TrialRecord) -> str:
+    """Return the text of one seed's env steps to solve; one that still trains may solve yet."""
+    cell = _cell("num_env_steps", num_env_steps)
+    if cell.value is not None:
+        return cell.text
+    return "not solved" if trial.status in FINISHED else "not ended yet"
+
+
 def _lacking(trials: Sequence[TrialRecord], names: Sequence[str]) -> set[str]:
-    """Return the names of values that some trials don't have, as they don't act there."""
-    return {name for name in names if any(lacks(trial.point, name) for trial in trials)}
+    """Return the names of values that some trials don't have, or had not for a time, as they don't act there."""
+    points = [point for trial in trials for point in points_of(trial)]
+    return {name for name in names if any(lacks(point, name) for point in points)}
 
 
 def _cell(name: str, value: Any, *, is_empty: bool = False) -> Cell:

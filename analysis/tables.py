@@ -123,6 +123,14 @@ def env_steps_to(
         changed_at: The iterations after which a trial of a population went on from another's copy: the mean is of the
             episodes since then.
     """
+    found = _first_to(threshold, iterations, num_episodes, changed_at)
+    return None if found is None else found.num_env_steps
+
+
+def _first_to(
+    threshold: float | None, iterations: Sequence[IterationRecord], num_episodes: int, changed_at: Collection[int]
+) -> IterationRecord | None:
+    """Return the iteration whose training return first reached a threshold, as `env_steps_to` has it."""
     if threshold is None:
         return None
     to_come = deque(sorted(changed_at))
@@ -135,7 +143,7 @@ def env_steps_to(
             num_since += len(item.episode_returns)
         value, num_played = item.training_return, item.num_episodes if num_since is None else num_since
         if num_played >= num_episodes and value is not None and value >= threshold:
-            return item.num_env_steps
+            return item
     return None
 
 
@@ -143,6 +151,18 @@ def _env_steps_to_solve(
     trial: TrialRecord, threshold: float | None, iterations: Sequence[IterationRecord]
 ) -> int | None:
     return env_steps_to(threshold, iterations, changed_at=[change.iteration for change in trial.changes])
+
+
+def solving_point(trial: TrialRecord, threshold: float | None, iterations: Sequence[IterationRecord]) -> dict[str, Any]:
+    """Return the searched values that a trial reached a threshold with, to stand beside its env steps to it.
+
+    Of a trial that never did, they are those of `shown_point`.
+    """
+    if not trial.changes:
+        return trial.point
+    changed_at = [change.iteration for change in trial.changes]
+    found = _first_to(threshold, iterations, SOLVED_OVER_NUM_EPISODES, changed_at)
+    return shown_point(trial) if found is None else trial.point_at(found.iteration)
 
 
 def env_steps_to_evaluation(threshold: float | None, iterations: Sequence[IterationRecord]) -> int | None:
@@ -295,8 +315,9 @@ def steps_to_solve_frame(
     Returns:
         The columns point_index, one for each searched hyperparameter, num_seeds (those that have ended or solved),
         num_solved, median_num_env_steps (missing if that is "never": a seed that ended unsolved counts as later than
-        any other) and num_env_steps_seed_<i>, which is missing where seed i did not solve. Fewest median env steps
-        first, then those that more seeds solved.
+        any other) and num_env_steps_seed_<i>, which is missing where seed i did not solve, or was not trained. Fewest
+        median env steps first, then those that more seeds solved. In a population, the searched values are those that
+        the env was solved with (see `solving_point`).
     """
     import pandas as pd
 
@@ -315,10 +336,12 @@ def steps_to_solve_frame(
         # A seed that still runs may yet solve it.
         known = [steps[t.seed_index] for t in members if t.status in FINISHED or steps[t.seed_index] is not None]
         solved = [value for value in known if value is not None]
+        # Seeds of one point have the same values; a population, whose trials change theirs, has one seed a point.
+        point = solving_point(members[0], threshold, results.get(members[0].trial_id, ()))
         rows.append(
             {
                 "point_index": index,
-                **{name: cell_value(members[0].point.get(name)) for name in names},
+                **{name: cell_value(point.get(name)) for name in names},
                 "num_seeds": len(known),
                 "num_solved": len(solved),
                 "median_num_env_steps": median_steps(known) if known else None,

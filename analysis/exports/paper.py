@@ -16,7 +16,7 @@ from analysis.plot_style import ACCENT, GRID, PALETTE, drawable, escape, new_fig
 from analysis.points import searched_names
 from analysis.statistics import seed_intervals
 from analysis.tables import cell_value
-from analysis.wording import counted, short_text
+from analysis.wording import counted, setting_text, short_text
 from policies.errors import CannotRunError, NotFoundError
 
 if TYPE_CHECKING:
@@ -63,10 +63,11 @@ class Curve:
 def setting_curves(data: SweepData, *, top: int, returns: Returns = "evaluation") -> list[Curve]:
     """Return the learning curves of the leading settings of a sweep, best first.
 
-    Returns are interpolated between those that are known. A seed that ended before others of the figure, because it
-    reached its goal or failed, is held at its last value: to leave it out would make the mean that of the others. One
-    that showed no such return has no value to be held at; the curve is that of the others, and counts those it lacks.
-    The intervals are `statistics.seed_intervals` over all settings shown, at each number of env steps by itself.
+    Returns are interpolated between those that are known, and a curve begins where all of its seeds have shown one. A
+    seed that ended before others of the figure, because it reached its goal or failed, is held at its last value: to
+    leave it out would make the mean that of the others. One that showed no such return has no value to be held at; the
+    curve is that of the others, and counts those it lacks. The intervals are `statistics.seed_intervals` over all
+    settings whose curves have begun, at each number of env steps by itself.
 
     Args:
         data: The sweep.
@@ -85,10 +86,14 @@ def curves_of(data: SweepData, settings: Sequence[SettingScores], *, returns: Re
             known.append((item, seeds))
     if not known:
         return []
-    start = max(steps[0] for _, seeds in known for steps, _ in seeds)
+    # Each begins by itself: one that is first evaluated late must not hide how the others began.
+    starts = [max(steps[0] for steps, _ in seeds) for _, seeds in known]
     stop = max(steps[-1] for _, seeds in known for steps, _ in seeds)
-    grid = np.linspace(min(start, stop), stop, _NUM_POINTS if stop > start else 1)
-    values = [np.stack([np.interp(grid, *seed) for seed in seeds]) for _, seeds in known]
+    grid = np.unique(np.concatenate([np.linspace(min(starts), stop, _NUM_POINTS), starts]))
+    places = [grid[grid >= start] for start in starts]
+    values = [
+        np.stack([np.interp(own, *seed) for seed in seeds]) for own, (_, seeds) in zip(places, known, strict=True)
+    ]
     labels = _labels([item for item, _ in known])
     bands = _bands(values)
     return [
@@ -96,15 +101,15 @@ def curves_of(data: SweepData, settings: Sequence[SettingScores], *, returns: Re
             label=label,
             num_seeds=len(seeds),
             num_without=len(item.trial_ids) - len(seeds),
-            num_env_steps=grid,
+            num_env_steps=steps,
             mean=own.mean(axis=0),
             lower=None if band is None else band[0],
             upper=None if band is None else band[1],
             least=float(own.min()),
             most=float(own.max()),
-            first_end=min(steps[-1] for steps, _ in seeds),
+            first_end=min(seed[-1] for seed, _ in seeds),
         )
-        for label, (item, seeds), own, band in zip(labels, known, values, bands, strict=True)
+        for label, (item, seeds), steps, own, band in zip(labels, known, places, values, bands, strict=True)
     ]
 
 
@@ -173,7 +178,8 @@ def _draw_curve(axes: Axes, curve: Curve, label: str, color: str) -> None:
     if after.size:
         # The dashes begin where the line ends, so that there is no gap.
         rest = slice(max(0, int(after[0]) - 1), None)
-        axes.plot(steps[rest], mean[rest], color=color, linewidth=1.0, linestyle=(0, (3, 2)))
+        dashes = (0, (3, 2))
+        axes.plot(steps[rest], mean[rest], color=color, linewidth=1.0, linestyle=dashes, marker=marker, markersize=3)
     if curve.lower is not None and curve.upper is not None:
         low, high = drawable(curve.lower), drawable(curve.upper)
         axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
@@ -225,26 +231,41 @@ def _known(data: SweepData, trial_id: str, returns: Returns) -> tuple[NDArray[np
 def _bands(
     values: Sequence[NDArray[np.float64]],
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]] | None]:
-    """Return the ends of the intervals of each setting, or None of those without one."""
-    if max(len(own) for own in values) < 2:
-        return [None] * len(values)
+    """Return the ends of the intervals of each setting, or None of those without one.
+
+    Args:
+        values: The returns of the seeds of each setting, shape (seeds, T). All end at the same place, so that those of
+            a setting with fewer places are at the last ones.
+    """
+    # Until a setting with two seeds has begun, nothing is known of how seeds differ.
+    num_places = max((own.shape[1] for own in values if len(own) > 1), default=0)
+    ends = np.full((len(values), 2, num_places), np.nan)
     try:
-        columns = [seed_intervals([own[:, place] for own in values]) for place in range(values[0].shape[1])]
+        for place in range(-num_places, 0):
+            begun = [index for index, own in enumerate(values) if own.shape[1] >= -place]
+            intervals = seed_intervals([values[index][:, place] for index in begun])
+            ends[begun, :, place] = [(interval.lower, interval.upper) for interval in intervals]
     except ValueError:  # so large that their squares are not finite
         return [None] * len(values)
     return [
-        (np.array([column[index].lower for column in columns]), np.array([column[index].upper for column in columns]))
-        if len(own) > 1
-        else None
+        (ends[index, 0, -own.shape[1] :], ends[index, 1, -own.shape[1] :]) if len(own) > 1 else None
         for index, own in enumerate(values)
     ]
 
 
 def _labels(settings: Sequence[SettingScores]) -> list[str]:
-    """Return what tells settings apart: the values that are not the same in all of them, or all values of a single."""
+    """Return what tells settings apart: the values that are not the same in all of them, or all values of a single.
+
+    In as few digits as that takes; where four don't, and of equal settings, with their places before them.
+    """
     names = searched_names(item.point for item in settings)
     differing = [name for name in names if len({repr(cell_value(item.point.get(name))) for item in settings}) > 1]
     shown = differing or names
-    return [
-        ", ".join(f"{name} {short_text(item.point[name])}" for name in shown if name in item.point) for item in settings
-    ]
+    labels: list[str] = []
+    for text in (short_text, setting_text):
+        labels = [
+            ", ".join(f"{name} {text(item.point[name])}" for name in shown if name in item.point) for item in settings
+        ]
+        if len(set(labels)) == len(labels):
+            return labels
+    return [f"{place}. {label}".rstrip() for place, label in enumerate(labels, start=1)]

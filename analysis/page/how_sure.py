@@ -13,7 +13,7 @@ from analysis.records import IterationRecord, TrialRecord, finite_or_none
 from analysis.report_tables import Cell, Table, steps_table
 from analysis.statistics import tie_groups
 from analysis.strip_plot import Strip
-from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, steps_to_solve_frame
+from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, solving_point, steps_to_solve_frame
 from analysis.wording import NONE, number
 from policies import random_streams
 
@@ -164,7 +164,8 @@ def fewest_env_steps(
     # By columns: a row of them would have one type for all its numbers, and with it another word for "missing".
     first = {column: solving[column].iloc[0] for column in solving.columns}
     # The row has a cell for each hyperparameter that any trial has; what acts in this point is known by its trials.
-    values = point_text(next(trial.point for trial in trials if trial.point_index == first["point_index"]))
+    leader = next(trial for trial in trials if trial.point_index == first["point_index"])
+    values = point_text(solving_point(leader, goal, results.get(leader.trial_id, ())))
     who = f"{values} reaches" if values else "The sweep's one point reaches"
     median, num_seeds = finite_or_none(float(first["median_num_env_steps"])), int(first["num_seeds"])
     if median is None:

@@ -13,7 +13,8 @@ from synthetic_sweep import make_sweep
 import tune_jobs
 from analysis.exports.frames import SweepData
 from analysis.exports.paper import learning_figure, save_figure, setting_curves
-from analysis.records import IterationRecord
+from analysis.records import IterationRecord, TrialRecord
+from analysis.statistics import seed_intervals
 from policies.errors import NotFoundError, SpecError
 from tests.narrowing import present
 
@@ -63,6 +64,76 @@ def test_a_seed_without_a_return_is_counted_though_no_curve_is_of_it() -> None:
     assert (curve.num_seeds, curve.num_without, curve.mean[-1]) == (2, 1, 5.0)
     (label,) = [text.get_text() for text in learning_figure([("mine", data)]).legends[0].get_texts()]
     assert label.endswith("(2 of 3 seeds)")
+
+
+def of_settings(*settings: tuple[dict[str, Any], list[list[tuple[int, float]]]]) -> SweepData:
+    """A setting for each point, with a seed for each of its curves; the last of them scores most."""
+    trials: list[TrialRecord] = []
+    results: dict[str, list[IterationRecord]] = {}
+    for place, (point, curves) in enumerate(settings):
+        (made,) = make_sweep(points=[point], with_best=False).trials
+        for seed, curve in enumerate(curves):
+            trial_id = f"t{len(trials):04d}"
+            given = {"trial_id": trial_id, "index": len(trials), "point_index": place, "seed_index": seed}
+            trials.append(made.model_copy(update=given | {"point": point}))
+            results[trial_id] = held(curve)
+    return SweepData(trials, results, "final", num_env_steps=200, threshold=None)
+
+
+def test_a_curve_begins_where_its_own_seeds_do_not_where_the_last_of_all_does() -> None:
+    """As of a large train batch, of which an iteration is many env steps, beside a small one."""
+    early = [[(10, 0.0), (100, 90.0)], [(20, 2.0), (100, 92.0)]]
+    late = [[(70, 500.0), (100, 700.0)], [(80, 500.0), (100, 720.0)], [(70, 400.0), (100, 700.0)]]
+    second, first = setting_curves(of_settings(({"lr": 0.1}, early), ({"lr": 0.2}, late)), top=2)[::-1]
+    assert (second.label, first.label) == ("lr 0.1", "lr 0.2")
+    assert [(curve.num_env_steps[0], curve.num_env_steps[-1]) for curve in (second, first)] == [(20, 100), (80, 100)]
+    assert (second.mean[0], second.least) == (6.0, 2.0)
+    assert second.num_env_steps.size > 100
+    for curve in (first, second):
+        assert present(curve.lower).shape == present(curve.upper).shape == curve.mean.shape
+        assert (present(curve.lower) < curve.mean).all()
+    # Alone until the other begins, of which the intervals then learn how much seeds differ.
+    (alone,) = setting_curves(of_settings(({"lr": 0.1}, early)), top=1)
+    expected = stats.t.interval(0.95, 1, loc=6.0, scale=stats.sem([10.0, 2.0]))
+    assert (present(second.lower)[0], present(second.upper)[0]) == pytest.approx(expected)
+    assert (present(alone.lower)[0], present(alone.upper)[0]) == pytest.approx(expected)
+    own = [interval[-1] for interval in (present(second.lower), present(second.upper))]
+    both = seed_intervals([[700.0, 720.0, 700.0], [90.0, 92.0]])[1]
+    assert own == pytest.approx([both.lower, both.upper])
+
+
+@pytest.mark.parametrize("num_late", [1, 2])
+def test_bands_are_of_settings_with_several_seeds_wherever_others_begin(num_late: int) -> None:
+    one, several = [[(10, 0.0), (100, 90.0)]], [[(50, 500.0), (100, 700.0)], [(50, 500.0), (100, 720.0)]][:num_late]
+    late, early = setting_curves(of_settings(({"lr": 0.1}, one), ({"lr": 0.2}, several)), top=2)
+    assert (early.num_env_steps[0], late.num_env_steps[0]) == (10, 50)
+    assert early.lower is None
+    assert (late.lower is None) == (num_late == 1)
+    if late.lower is not None:
+        assert late.lower.shape == late.mean.shape
+        assert np.isfinite(late.lower).all()
+
+
+def test_a_curve_of_one_place_is_a_dot_also_after_its_first_seed_has_ended() -> None:
+    figure = learning_figure([("mine", of_curves([(100, 0.0)], [(200, 4.0)]))])
+    dots = [line for line in figure.axes[0].lines if line.get_marker() == "o" and np.size(line.get_xdata())]
+    assert [(np.ravel(line.get_xdata())[0], np.ravel(line.get_ydata())[0]) for line in dots] == [(200, 2.0)]
+
+
+@pytest.mark.parametrize(
+    ("points", "labels"),
+    [
+        ([{"lr": 0.001}, {"lr": 0.002}], ["lr 0.002", "lr 0.001"]),
+        ([{"lr": 0.0012345}, {"lr": 0.0012312}], ["lr 0.001231", "lr 0.001234"]),
+        ([{"lr": 0.00123412}, {"lr": 0.00123408}], ["1. lr 0.001234", "2. lr 0.001234"]),
+        ([{"lr": 0.001}, {"lr": 0.001}], ["1. lr 0.001", "2. lr 0.001"]),
+        ([{}, {}], ["1.", "2."]),
+    ],
+)
+def test_no_two_settings_have_one_label(points: list[dict[str, Any]], labels: list[str]) -> None:
+    curves = [[[(100, value), (200, value)]] for value in (1.0, 2.0)]
+    data = of_settings(*zip(points, curves, strict=True))
+    assert [curve.label for curve in setting_curves(data, top=2)] == labels
 
 
 def test_one_seed_has_no_band() -> None:

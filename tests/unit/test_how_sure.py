@@ -9,6 +9,7 @@ from synthetic_sweep import make_points, make_sweep
 
 from analysis.page import how_sure
 from analysis.page.scores import interval_of, score_text
+from analysis.report_tables import steps_table
 
 
 def test_settings_that_share_a_letter_are_not_told_apart() -> None:
@@ -60,6 +61,25 @@ def test_what_solves_first_is_told_by_what_acts_in_it(points: list[dict[str, Any
     synthetic = make_sweep(points=points, threshold=195.0)
     text = how_sure.fewest_env_steps(synthetic.trials, synthetic.results, 195.0)
     assert text.startswith(f"{said}lr 0.003 reaches a mean training return of 195 ")
+
+
+def test_a_seed_that_was_not_trained_or_still_trains_is_not_called_unsolved() -> None:
+    """Points have different numbers of seeds once some were given more, as by `confirm`."""
+    made = make_sweep(points=[{"lr": 3e-3}, {"lr": 2.5e-3}], with_best=False)
+    first, second = made.trials
+    rows = made.results["t0000"]
+
+    def told(**of_third: Any) -> list[str]:
+        more = [first.model_copy(update={"trial_id": f"t000{k + 1}", "index": k + 1, "seed_index": k}) for k in (1, 2)]
+        trials = [first, second, more[0], more[1].model_copy(update=of_third)]
+        results = made.results | {"t0002": rows, "t0003": rows[:3]}
+        return [row[-1].text for row in steps_table(trials, results, goal=195.0).rows]
+
+    one, other = (f"{made.results[trial_id][-1].num_env_steps:,}" for trial_id in ("t0000", "t0001"))
+    assert told() == [f"{one}, {one}, not solved", other]
+    assert told(status="failed") == [f"{one}, {one}, not solved", other]
+    assert told(status="running") == [f"{one}, {one}, not ended yet", other]
+    assert told(status="pending") == [f"{one}, {one}, not ended yet", other]
 
 
 def test_nothing_is_compared_where_there_is_one_setting() -> None:

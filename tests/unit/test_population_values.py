@@ -3,6 +3,7 @@
 import io
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 from test_monitor import make_monitor
@@ -11,9 +12,12 @@ from analysis.charts.model import Plots
 from analysis.charts.population import make_charts
 from analysis.charts.subject import Subject
 from analysis.importance import what_mattered
-from analysis.records import ChangeRecord, CheckpointRecord, SweepRecord, TrialRecord
+from analysis.page.how_sure import fewest_env_steps
+from analysis.plot_style import group_names, numeric_names
+from analysis.plots import learning_curves, score_by_lr
+from analysis.records import ChangeRecord, CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from analysis.report_tables import steps_table, trial_table
-from analysis.tables import trials_frame
+from analysis.tables import steps_to_solve_frame, trials_frame
 from tune_jobs.cli.trials_table import chosen, print_table
 from tune_jobs.sweeps.live_table import render, summary_line
 
@@ -95,6 +99,57 @@ def test_the_reports_table_shows_those_that_a_score_was_reached_with_also_if_the
         ]
         assert trials_frame(trials)["prioritized_alpha"].tolist()[0] == 0.3
         assert steps_table(trials, {}, goal=1.0).headings[:3] == ["lr", "replay", "prioritized_alpha"]
+
+
+def solving_at(iteration: int, num_iterations: int = 20) -> list[IterationRecord]:
+    return [
+        IterationRecord(
+            iteration=number, num_env_steps=number * 1_000, num_episodes=number * 100, time_s=1.0,
+            training_return=200.0 if number >= iteration else 20.0, episode_returns=(200.0,) * 100,
+        )
+        for number in range(1, num_iterations + 1)
+    ]  # fmt: skip
+
+
+def test_env_steps_to_solve_are_told_with_the_values_that_it_was_solved_with() -> None:
+    """Not with the newest ones, nor with those that the best evaluation was reached with."""
+    changes = change(10, PRIORITIZED, UNIFORM), change(15, UNIFORM, {**UNIFORM, "lr": 1e-9})
+    first = trial(0, {**UNIFORM, "lr": 1e-9}, *changes, best_at=20)
+    for iteration, values, lr in [
+        (8, "lr 0.005, replay prioritized, prioritized_alpha 0.3", 0.005),
+        (10, "lr 0.005, replay prioritized, prioritized_alpha 0.3", 0.005),
+        (12, "lr 0.001, replay uniform", 0.001),
+        (18, "lr 1e-09, replay uniform", 1e-9),
+    ]:
+        trials, results = [first, trial(1, UNIFORM)], {"t0000": solving_at(iteration), "t0001": solving_at(30)}
+        assert fewest_env_steps(trials, results, 195.0).startswith(f"{values} reaches ")
+        (row,) = steps_table(trials, results, goal=195.0).rows
+        told = [cell.text for cell in row]
+        assert told[:3] == [f"{lr:g}", *(["prioritized", "0.3"] if lr == 0.005 else ["uniform", ""])]
+        assert told[-1] == f"{iteration},000"
+        assert steps_to_solve_frame(trials, results, threshold=195.0)["lr"].tolist() == [lr, 0.001]
+
+
+def test_what_acts_in_all_trials_by_now_is_empty_where_it_did_not_when_the_env_was_solved() -> None:
+    trials = [trial(0, PRIORITIZED, change(10, UNIFORM, PRIORITIZED)), trial(1, PRIORITIZED)]
+    (row,) = steps_table(trials, {"t0000": solving_at(8), "t0001": solving_at(30)}, goal=195.0).rows
+    assert [cell.text for cell in row[:3]] == ["0.001", "uniform", ""]
+
+
+def test_a_trial_that_did_not_solve_has_the_values_of_its_score_beside_it() -> None:
+    frame = steps_to_solve_frame([FIRST], {"t0000": solving_at(30)}, threshold=195.0)
+    assert frame["lr"].tolist() == trials_frame([FIRST])["lr"].tolist() == [0.005]
+
+
+def test_figures_have_a_score_at_the_values_that_it_was_reached_with() -> None:
+    trials = [FIRST, trial(1, UNIFORM)]
+    assert numeric_names(trials) == ["lr"]
+    assert group_names(trials, "lr") == ["replay", "prioritized_alpha"]
+    axes = score_by_lr(trials).axes[0]
+    found = {str(dots.get_label()): np.asarray(dots.get_offsets()).tolist() for dots in axes.collections}
+    assert found == {"prioritized · 0.3": [[0.005, 480.0]], "uniform": [[0.001, 479.0]]}
+    (line, _) = learning_curves(trials, {"t0000": solving_at(10)}, threshold=195.0).axes[0].lines
+    assert line.get_label() == "0.005 · prioritized"
 
 
 @pytest.mark.parametrize("others_began_with", [0.2, 0.3])

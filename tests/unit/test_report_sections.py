@@ -56,6 +56,19 @@ def test_the_cost_of_a_pack_is_shared_by_its_trials() -> None:
     assert [row[column].text for row in table.rows] == ["5.0", "5.0"]
 
 
+def test_the_spread_of_what_trials_cost_is_told_in_whole_numbers() -> None:
+    synthetic = packed_pair()
+    synthetic.trials[:] = [
+        trial.model_copy(update={"num_env_steps": steps, "node": node, "ended_at": time_s, "time_s": time_s})
+        for trial, steps, time_s, node in zip(
+            synthetic.trials, (51_200, 102_403), (12345.6, 23456.7), ("a", "b"), strict=True
+        )
+    ]
+    facts = facts_of(with_trials(synthetic, engine="rllib"))
+    assert facts["env steps"].endswith("; a trial 51,200 to 102,403, median 76,802")
+    assert facts["core-seconds"].endswith("; a trial 12,346 to 23,457, median 17,901")
+
+
 @pytest.mark.parametrize(
     ("state", "run_time_s", "said"),
     [("running", 0.0, None), ("running", 70.4, "1 min 10 s before this run"), ("interrupted", 70.4, "1 min 10 s")],

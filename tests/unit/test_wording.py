@@ -49,6 +49,9 @@ def test_numbers_read_well() -> None:
     assert [number(v) for v in (None, 0, 50176, 0.00123456, 1e-7, 200.0, True, "relu")] == [
         NONE, "0", "50,176", "0.001235", "1e-07", "200", "True", "relu",
     ]  # fmt: skip
+    assert [number(v) for v in (999.4, 1234.6, 9999.6, 12345.6, -5e5 - 0.4, 1.5e15, math.inf, math.nan)] == [
+        "999.4", "1,235", "10,000", "12,346", "-500,000", "1.5e+15", "inf", "nan",
+    ]  # fmt: skip
     assert [duration(v) for v in (0.0, 42.2, 70.4, 7500)] == ["0.0 s", "42 s", "1 min 10 s", "2 h 5 min"]
     assert [duration(v, tenths=False) for v in (0.4, 9.7, 59.6)] == ["0 s", "10 s", "1 min 0 s"]
     assert [duration(v, none="-") for v in (math.nan, math.inf)] == ["-", "-"]
