@@ -20,7 +20,7 @@ from policies.envs.faults import close_env
 from policies.envs.make import make_env
 from policies.envs.masks import FORBIDDEN
 from policies.envs.own_actions import Choices
-from policies.envs.rendering import draw_without_display, drawing_hint, picture_of
+from policies.envs.rendering import draw_without_display, drawing_hint, frames_per_second, picture_of
 from policies.errors import EnvError, said_by
 
 ScoreKind = Literal["probabilities", "values", "advantages", "gaussian"]
@@ -100,7 +100,7 @@ def watch_episode(
     env, why_not = _drawable(env_id, env_args)
     try:
         check_policy(policy, env)
-        fps = float(env.metadata.get("render_fps") or 30.0)
+        fps = frames_per_second(env.metadata)
         info = LiveInfo(env_id, policy.description, fps, not why_not, why_not, _actions(env))
     except BaseException:
         close_env(env)

@@ -27,7 +27,9 @@ from typing_extensions import override
 
 from policies import random_streams
 from policies.envs.action_bounds import ToBounds
+from policies.envs.checked import unsound_number
 from policies.envs.flat import FlatBox
+from policies.envs.given_numbers import numbers_of
 from policies.envs.make import check_env, make_env
 from policies.envs.mask_hints import argument_hint
 from policies.envs.mask_settings import ACTION_MASK
@@ -93,8 +95,9 @@ class Policy(ABC):
             of dicts or tuples.
 
         Raises:
-            ObservationError: The observations have another shape, or are not numbers; there is no mask where one is
-                needed, one that is none, or one that a policy trained without masks can't use.
+            ObservationError: The observations have another shape, are not numbers or not finite, or of an image of
+                bytes no bytes; there is no mask where one is needed, one that is none, or one that a policy trained
+                without masks can't use.
         """
         space = self.observation_space
         shape = space.shape or ()
@@ -105,8 +108,8 @@ class Policy(ABC):
                 raise ValueError("there is a mask, but it was trained without one")  # noqa: TRY301 (as the others)
             elif isinstance(space, FlatBox):
                 observations = space.flat_or_own(observations)
-            batch = np.asarray(observations, dtype=np.float32)
-        except (TypeError, ValueError) as error:
+            batch = numbers_of(observations, space)
+        except (TypeError, ValueError, OverflowError) as error:
             hint = self._what_to_pass()
             if isinstance(space, MaskedBox) and not wrapped_by(self.env_args):
                 hint += argument_hint(space, self.env_args.get(ACTION_MASK))
@@ -120,6 +123,11 @@ class Policy(ABC):
                 f"shape {shape}, or a batch of them.",
                 f"{self._what_to_pass()}.",
             )
+        if problem := unsound_number(batch, space):
+            raise ObservationError(
+                f"Observations of {self.env_id} must be finite: one was {problem}.", f"{self._what_to_pass()}."
+            )
+        batch = np.asarray(batch, dtype=np.float32)
         actions = self._act_batch(batch[None] if single else batch)
         if not single:
             return own_actions(self.action_space, actions)
@@ -337,18 +345,39 @@ def action_function(
     """Return the function that turns a network's outputs, shape (num, num_outputs), into actions for the env."""
     if isinstance(action_space, gym.spaces.Discrete):
         start = int(action_space.start)
-        return lambda outputs: np.argmax(outputs, axis=1) + start
+        return functools.partial(_largest, start=start)
     if isinstance(action_space, Choices):
         return functools.partial(largest_of_each, sizes=action_space.sizes)
-    low, high, dtype = action_space.low, action_space.high, action_space.dtype
+    low, high = action_space.low, action_space.high
     size = math.prod(action_space.shape)
     transform = portable.action_transform
     to_bounds = ToBounds(action_space)
     if transform == "by_component" or (transform == "unsquash" and to_bounds.stretches_all):
-        return lambda outputs: to_bounds(outputs[:, :size])
+        return functools.partial(_within, size=size, to_bounds=to_bounds)
     if transform == "none":
-        return lambda outputs: outputs[:, :size].astype(dtype)
-    return lambda outputs: np.clip(outputs[:, :size], low, high).astype(dtype)
+        return functools.partial(_as_they_are, size=size, dtype=low.dtype)
+    return functools.partial(_clipped, low=low, high=high)
+
+
+# No closures: a policy can be pickled, for other processes.
+
+
+def _largest(outputs: NDArray[Any], start: int) -> NDArray[np.int64]:
+    places: NDArray[np.int64] = np.argmax(outputs, axis=1)
+    return places + start
+
+
+def _within(outputs: NDArray[Any], size: int, to_bounds: ToBounds) -> NDArray[Any]:
+    return to_bounds(outputs[:, :size])
+
+
+def _as_they_are(outputs: NDArray[Any], size: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    return outputs[:, :size].astype(dtype)
+
+
+def _clipped(outputs: NDArray[Any], low: NDArray[Any], high: NDArray[Any]) -> NDArray[Any]:
+    clipped: NDArray[Any] = np.clip(outputs[:, : low.size], low, high).astype(low.dtype)
+    return clipped
 
 
 def largest_of_each(outputs: NDArray[Any], sizes: tuple[int, ...]) -> NDArray[np.int64]:

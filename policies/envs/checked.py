@@ -100,13 +100,32 @@ def check_observation(observation: Any, env_id: str, num_steps: int, space: gym.
     values = np.asarray(observation)
     if is_sound(values):
         return
-    place = int(np.flatnonzero(~(np.abs(values) <= _LARGEST_32))[0])
+    place = _first_unsound(values)
     which = f"after env step {num_steps}" if num_steps else "from reset(), at the beginning"
     raise EnvFailedError(
         f"The observation {which} of an episode of {env_id} was {_name(float(values.flat[place]))} "
         f"({_where(values, place, space)}).",
         _HINT,
     )
+
+
+def unsound_number(observations: NDArray[Any], space: gym.Space[Any]) -> str | None:
+    """Say which number of an observation, or of a batch, is the first that is not finite, and where; None: none is.
+
+    Args:
+        observations: Numbers of the space's shape, or several of such.
+        space: What they are of.
+    """
+    if is_sound(observations):
+        return None
+    index, place = divmod(_first_unsound(observations), math.prod(space.shape or ()))
+    values = observations.reshape(-1, *(space.shape or ()))[index]
+    which = "" if observations.shape == space.shape else f" in observation {index} of the batch, counted from 0"
+    return f"{_name(float(values.flat[place]))} ({_where(values, place, space)}){which}"
+
+
+def _first_unsound(values: NDArray[Any]) -> int:
+    return int(np.flatnonzero(~(np.abs(values) <= _LARGEST_32))[0])
 
 
 def _where(values: NDArray[Any], place: int, space: gym.Space[Any] | None) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.errors import shortened
+
 
 class MaskProblemError(ValueError):
     """A value is no mask; the message fits behind the value."""
@@ -46,6 +48,22 @@ def checked_mask(mask: Any, sizes: tuple[int, ...]) -> NDArray[np.float32]:
         number = int(np.flatnonzero(allowed == 0)[0])
         raise MaskProblemError(f"which forbids every value of choice {number}, counted from 0")
     return checked
+
+
+def check_masks(masks: NDArray[Any], sizes: tuple[int, ...]) -> None:
+    """Check masks that are in vectors of numbers already, shape (..., numbers of a mask).
+
+    Raises:
+        ValueError: One is none; the message shows the first.
+    """
+    rows = masks.reshape(-1, masks.shape[-1])
+    if ((rows == 0) | (rows == 1)).all() and np.logical_or.reduceat(rows, _starts(sizes), axis=1).all():
+        return
+    for row in rows:
+        try:
+            checked_mask(row, sizes)
+        except MaskProblemError as error:
+            raise ValueError(f"{shortened(row.tolist())} is the mask, {error}") from None
 
 
 def listed_mask(actions: Any, size: int, first: int) -> NDArray[np.float32]:

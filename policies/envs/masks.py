@@ -22,8 +22,9 @@ from typing_extensions import override
 
 from policies.envs.byte_images import as_bytes
 from policies.envs.flat import FlatBox, needs_flattening
+from policies.envs.given_numbers import numbers_of
 from policies.envs.mask_settings import ACTION_MASK, METHOD, Setting, lists_actions, names_in
-from policies.envs.mask_values import MaskProblemError, checked_mask, is_one_mask, listed_mask
+from policies.envs.mask_values import MaskProblemError, check_masks, checked_mask, is_one_mask, listed_mask
 from policies.envs.own_actions import sizes_of
 from policies.envs.signatures import needs_nothing
 from policies.errors import EnvError, shortened
@@ -118,7 +119,10 @@ class MaskedBox(gym.spaces.Box):
         if mask is None:
             if not self._begins(observations):
                 raise ValueError("there is no mask")
-            return observations
+            rows = numbers_of(observations, self)
+            check_masks(rows[..., : self.num_masked], self.sizes)
+            numbers_of(rows[..., self.num_masked :], self.seen)
+            return rows
         vectors = self._unmasked(observations)
         if vectors.ndim == 1:
             return np.concatenate([self._checked(mask), vectors])
@@ -129,17 +133,16 @@ class MaskedBox(gym.spaces.Box):
         masks = np.array([self._checked(one) for one in mask]).reshape(-1, self.num_masked)
         return np.concatenate([masks, vectors], axis=-1)
 
-    def _unmasked(self, observations: Any) -> NDArray[np.float32]:
+    def _unmasked(self, observations: Any) -> NDArray[Any]:
         """Return what networks see as vectors, shape (numbers,) or (num, numbers), without masks that there may be."""
         seen = self.seen
-        rows = seen.flat_or_own(observations) if isinstance(seen, FlatBox) else observations
-        array = np.asarray(rows, np.float32)
+        array = np.asarray(seen.flat_or_own(observations) if isinstance(seen, FlatBox) else observations)
         num_dims, num_seen = len(seen.shape), math.prod(seen.shape)
         if array.shape[-num_dims:] == seen.shape:
-            return array.reshape(*array.shape[:-num_dims], num_seen)
-        if array.shape[-1:] != self.shape:
+            array = array.reshape(*array.shape[:-num_dims], num_seen)
+        elif array.shape[-1:] != self.shape:
             raise ValueError(f"there is an observation of shape {array.shape[-num_dims:]}")
-        return array[..., -num_seen:]
+        return numbers_of(array[..., -num_seen:], seen)
 
     def _begins(self, observations: Any) -> bool:
         """Whether something is a vector that begins with a mask, or a batch of such."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import math
 import os
 import re
 import subprocess
@@ -21,6 +22,8 @@ from policies.errors import said_by
 
 _Made = TypeVar("_Made")
 
+_DEFAULT_FPS = 30.0
+"""Frames a second of an environment whose metadata has no `render_fps`, or one that is no rate."""
 _RENDER_MODE = "render_mode"
 _MUJOCO_GL = "MUJOCO_GL"
 _MUJOCO_BACKENDS = ("egl", "osmesa")
@@ -39,6 +42,15 @@ _GRAPHICS_PACKAGES = frozenset({"OpenGL", "dm_control", "glfw", "mujoco", "pygam
 _SAYS_WHO_ERRED = "pygame"
 """The one of them whose own class of errors is also that of what its caller did wrong, as to draw without a font."""
 _TRIAL_TIMEOUT_S = 30.0
+
+
+def frames_per_second(metadata: Mapping[str, Any]) -> float:
+    """Return the frames a second of an environment's own time, by its metadata."""
+    try:
+        rate = float(metadata.get("render_fps") or _DEFAULT_FPS)
+    except (TypeError, ValueError):  # whatever it is, it is no number
+        return _DEFAULT_FPS
+    return rate if 0 < rate < math.inf else _DEFAULT_FPS
 
 
 def draw_without_display() -> None:

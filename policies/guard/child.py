@@ -118,6 +118,14 @@ def _see(asked: Mapping[str, Any]) -> None:
 # -- jobs
 
 
+def full_id(env_id: str) -> str:
+    """Run `policies.envs.ids.normalize_env_id`."""
+    from policies.envs.ids import normalize_env_id
+
+    with calls.inside(calls.Call.IMPORT):
+        return normalize_env_id(env_id)
+
+
 def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str, Any]:
     """Run `policies.envs.make.check_env` and return what it found as JSON."""
     from policies.envs.make import check_env as check
@@ -229,6 +237,7 @@ def _paths(files: Mapping[str, str | None]) -> dict[str, Any]:
 _JOBS: dict[str, Callable[..., Any]] = {
     job.__name__: job
     for job in (
-        check_env, check_seedable, measure_step, evaluate_policy, evaluate_policies, record_video, record_comparison,
+        full_id, check_env, check_seedable, measure_step, evaluate_policy, evaluate_policies, record_video,
+        record_comparison,
     )
 }  # fmt: skip

@@ -24,7 +24,7 @@ from policies.envs.first_step import Largest
 from policies.envs.make import EnvInfo
 from policies.envs.mask_hints import UnusedMask
 from policies.envs.spaces import space_from_description
-from policies.errors import EnvError, TuneJobsError
+from policies.errors import EnvError, EnvFailedError, TuneJobsError
 from policies.files import write_atomic, write_plain
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.spread import play_in_parts
@@ -46,6 +46,25 @@ def printing_to(log: Path) -> Iterator[None]:
             yield
         finally:
             guard.log = before
+
+
+def full_id(env_id: str, *, timeout_s: float = CALL_TIMEOUT_S) -> str:
+    """Run `policies.envs.ids.normalize_env_id` in the guard's child, which imports the module that an id names.
+
+    Returns:
+        The registered id; one that is not found as it is, since whoever makes the environment says what is wrong.
+
+    Raises:
+        EnvFailedError: Its module hangs, or ended the process.
+    """
+    try:
+        with guarding() as guard:
+            found: str = guard.run("full_id", env_id, timeout_s=timeout_s)
+    except EnvFailedError:
+        raise
+    except EnvError:
+        return env_id
+    return found
 
 
 def check_env(

@@ -21,7 +21,7 @@ from policies.acting.baselines import ConstantPolicy
 from policies.acting.live import watch_episode
 from policies.acting.movies import GifWriter, Mp4Writer, fitted
 from policies.acting.video import record_video
-from policies.envs.rendering import picture_of
+from policies.envs.rendering import frames_per_second, picture_of
 from policies.errors import EnvError
 from tests.narrowing import present
 
@@ -235,3 +235,23 @@ def test_render_modes_that_are_no_names_are_told_too(monkeypatch: pytest.MonkeyP
     policy = ConstantPolicy(Grows.observation_space, Grows.action_space, 0, env_id=ENV)
     with pytest.raises(EnvError, match=r"cannot be filmed: .*\(it has: None, human\)"):
         record_video(policy, env_id=ENV, seeds=1, mp4=tmp_path / "a.mp4")
+
+
+@pytest.mark.parametrize(("told", "filmed"), [(1000, 999.0), (-5, 30.0), (10, 10.0)])
+def test_an_environment_is_filmed_whatever_rate_it_tells(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, told: int, filmed: float
+) -> None:
+    monkeypatch.setitem(Grows.metadata, "render_fps", told)
+    assert record_video(policy(), env_id=ENV, seeds=0, mp4=tmp_path / "a.mp4", max_steps=2).lengths == (2,)
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))
+    assert next(reader)["fps"] == filmed
+    reader.close()
+
+
+@pytest.mark.parametrize("told", [None, 0, -5, np.nan, np.inf, "fast", [30, 30], np.array([1, 2])])
+def test_a_rate_that_is_none_is_as_if_it_were_not_told(monkeypatch: pytest.MonkeyPatch, told: Any) -> None:
+    monkeypatch.setitem(Grows.metadata, "render_fps", told)
+    info, steps = watch_episode(policy(), ENV, {}, 0)
+    assert info.fps == frames_per_second({}) == 30.0
+    steps.close()  # type: ignore[attr-defined]
+    assert [frames_per_second({"render_fps": rate}) for rate in (0.5, 1000, "20")] == [0.5, 1000.0, 20.0]

@@ -18,7 +18,7 @@ from policies.envs.modules import allow_modules
 from policies.envs.wrappers import RESERVED
 from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
-from policies.guard.guarded import check_env, evaluate_policy, record_comparison, record_video
+from policies.guard.guarded import check_env, evaluate_policy, full_id, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
 from policies.portable.file import is_policy_folder, read_policy
 from tune_jobs.spec.engines import Engine
@@ -184,10 +184,13 @@ def find_policy(
             verify_checkpoint(checkpoint)
             policy = load_policy(checkpoint)
             store = None
-    if env_id is not None and env_id != policy.env_id:
+    named = policy.env_id if env_id is None else env_id
+    if named != policy.env_id:
+        named = full_id(named, timeout_s=timeout_s)  # `Pendulum` may be the policy's own Pendulum-v1
+    if named != policy.env_id:
         # The constructor's arguments are those of the other environment; the wrappers are the policy's.
         wrappers = {key: value for key, value in policy.env_args.items() if key in RESERVED}
-        return PolicySource(policy, env_id, wrappers, timeout_s=timeout_s)
+        return PolicySource(policy, named, wrappers, timeout_s=timeout_s)
     return PolicySource(policy, policy.env_id, dict(policy.env_args), store, timeout_s)
 
 
