@@ -273,12 +273,42 @@ def test_the_jobs_of_an_older_version_are_kept(database_url: str) -> None:  # no
     job = add(Queue(engine), "a")
     with engine.begin() as connection:
         connection.execute(text("ALTER TABLE jobs DROP COLUMN finish_failed"))
+        connection.execute(text("ALTER TABLE sweeps DROP COLUMN created_at"))
         connection.execute(text("UPDATE alembic_version SET version_num = '0002'"))
     engine.dispose()
     engine = open_database(database_url)
     assert Queue(engine).jobs() == [job]
     assert Queue(engine).end(job.id, "completed", finish_failed=True).finish_failed is True
     engine.dispose()
+
+
+def test_the_labels_of_an_older_version_are_kept(database_url: str) -> None:  # noqa: F811
+    engine = open_database(database_url)
+    Labels(engine).change("a", owner="ann", note="mine", tags=["x"])
+    with engine.begin() as connection:
+        connection.execute(text("ALTER TABLE sweeps DROP COLUMN created_at"))
+        connection.execute(text("UPDATE alembic_version SET version_num = '0003'"))
+    engine.dispose()
+    engine = open_database(database_url)
+    labels = Labels(engine)
+    label = labels.of("a")
+    assert label == labels.all()["a"] == Label("ann", "mine", ("x",), None)
+    # It does not say of which sweep, and is believed.
+    assert label.of(1_700_000_000.25) == label
+    # Once somebody changes it, it does.
+    changed = labels.change("a", note="mine too", created_at=1_700_000_000.25)
+    assert changed == Label("ann", "mine too", ("x",), 1_700_000_000.25)
+    assert changed.of(1_700_000_000.5) == Label()
+    engine.dispose()
+
+
+def test_what_is_said_of_a_new_sweep_takes_nothing_over_from_an_earlier_one_of_the_name(engine: Engine) -> None:
+    labels, created_at = Labels(engine), 1_759_412_345.678912
+    labels.change("a", owner="ann", note="mine", tags=["x"], created_at=created_at)
+    labels.change("a", tags=["y"], created_at=created_at)
+    labels.change("a", note="still mine")
+    assert labels.of("a") == Label("ann", "still mine", ("y",), created_at)
+    assert labels.change("a", note="new", created_at=created_at + 60.0) == Label(None, "new", (), created_at + 60.0)
 
 
 def test_a_newer_database_is_refused(engine: Engine, database_url: str) -> None:  # noqa: F811

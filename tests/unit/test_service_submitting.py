@@ -1,5 +1,6 @@
 """Submissions that are repeated or come at once: one sweep each, whose it is, and no more than somebody may have."""
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,10 @@ from fastapi.testclient import TestClient
 from services import FAKE, client, service  # noqa: F401 (fixtures)
 from sqlalchemy.exc import OperationalError
 
+from policies.errors import SpecError
 from tune_jobs.service.database.opening import sqlite_url
 from tune_jobs.service.http.models import NewSweep
+from tune_jobs.service.jobs import Job
 from tune_jobs.service.service import Service
 
 # ruff: noqa: F811 - fixtures are named as arguments
@@ -53,6 +56,61 @@ def test_of_many_at_once_only_as_many_are_taken_as_may_be(
         found = sorted(pool.map(lambda _: submit(client), range(6)))
     assert found == [201, 201, 429, 429, 429, 429]
     assert len(service.queue.jobs()) == 2
+
+
+def begun_at_once(service: Service, monkeypatch: pytest.MonkeyPatch, *keys: str) -> list[tuple[Job, bool]]:
+    """Submit a named sweep, and again while it is planned: the second one is planned only after the first returned."""
+    submission = NewSweep(spec=FAKE, name="mine").submission()
+    planned = service.submitter._planned(submission)
+    first_plans, second_plans, first_returned = threading.Event(), threading.Event(), threading.Event()
+
+    def plan(_: Any) -> Any:
+        if first_plans.is_set():
+            second_plans.set()
+            assert first_returned.wait(20)
+        else:
+            first_plans.set()
+            assert second_plans.wait(20)
+        return planned
+
+    monkeypatch.setattr(service.submitter, "_planned", plan)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(service.submitter.submit, submission, owner="ann", key=keys[0])
+        assert first_plans.wait(20)
+        second = pool.submit(service.submitter.submit, submission, owner="ann", key=keys[1])
+        try:
+            found = [first.result(30)]
+        finally:
+            first_returned.set()
+        return [*found, second.result(30)]
+
+
+def test_a_named_sweep_that_is_asked_for_again_while_it_is_planned_is_the_same(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (first, first_is_new), (second, second_is_new) = begun_at_once(service, monkeypatch, "k", "k")
+    assert (first.id, first_is_new, second_is_new) == (second.id, True, False)
+    assert [job.sweep for job in service.queue.jobs()] == [sweep.name for sweep in service.storage.sweeps()] == ["mine"]
+
+
+def test_another_request_for_a_name_that_is_taken_meanwhile_is_refused(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SpecError, match="is already in"):
+        begun_at_once(service, monkeypatch, "k", "another")
+    assert len(service.queue.jobs()) == len(service.storage.sweeps()) == 1
+
+
+def test_a_request_takes_the_room_of_no_other_where_it_repeats_one_that_began_meanwhile(service: Service) -> None:
+    submission = NewSweep(spec=FAKE).submission()
+    first: list[Job] = []
+
+    def full() -> None:
+        first.append(service.submitter.submit(submission, owner="ann", key="k")[0])
+        raise SpecError("There is no room.")
+
+    again, is_new = service.submitter.submit(submission, owner="ann", key="k", check_room=full)
+    assert (again.id, is_new) == (first[0].id, False)
 
 
 def test_a_sweep_whose_owner_could_not_be_written_has_one_once_it_is_asked_for_again(

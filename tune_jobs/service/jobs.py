@@ -44,6 +44,10 @@ class Job(BaseModel):
     started_at: float | None
     ended_at: float | None
 
+    def is_of_former(self, created_at: float) -> bool:
+        """Whether it was of an earlier sweep of this name: it ended before the present one was created."""
+        return self.ended_at is not None and self.ended_at < created_at
+
     @property
     def log_fields(self) -> dict[str, Any]:
         """What a line of the log that is about this job says besides its message."""

@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Engine, delete, insert, select, update
+from sqlalchemy import Engine, RowMapping, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from tune_jobs.service.database.tables import sweeps
+
+_SAME_S = 1e-3
+"""Two sweeps of one name are created further apart; a database may round."""
 
 
 @dataclass(frozen=True)
@@ -19,13 +22,21 @@ class Label:
     owner: str | None = None
     note: str = ""
     tags: tuple[str, ...] = ()
+    created_at: float | None = None
+    """When that sweep was created; None: an earlier version wrote it, which did not say."""
+
+    def of(self, created_at: float) -> Label:
+        """Return what counts of it for the sweep that has the name now: nothing if it was said of another one."""
+        if self.created_at is not None and abs(self.created_at - created_at) > _SAME_S:
+            return NOTHING
+        return self
 
 
 NOTHING = Label()
 
 
 class Labels:
-    """The labels in a database.
+    """The labels in a database, by the names of sweeps; a sweep may be gone, and its name another one's.
 
     Args:
         engine: The database.
@@ -38,22 +49,42 @@ class Labels:
         """Return the labels by sweep."""
         with self._engine.begin() as connection:
             rows = connection.execute(select(sweeps)).mappings().all()
-        return {row["name"]: Label(row["owner"] or None, row["note"], tuple(row["tags"])) for row in rows}
+        return {row["name"]: _label(row) for row in rows}
 
     def of(self, name: str) -> Label:
         """Return the label of one sweep."""
         with self._engine.begin() as connection:
             row = connection.execute(select(sweeps).where(sweeps.c.name == name)).mappings().first()
-        return NOTHING if row is None else Label(row["owner"] or None, row["note"], tuple(row["tags"]))
+        return NOTHING if row is None else _label(row)
 
     def change(
-        self, name: str, *, owner: str | None = None, note: str | None = None, tags: Sequence[str] | None = None
+        self,
+        name: str,
+        *,
+        owner: str | None = None,
+        note: str | None = None,
+        tags: Sequence[str] | None = None,
+        created_at: float | None = None,
     ) -> Label:
-        """Change what is given, and return the label."""
-        given: dict[str, Any] = {"owner": owner, "note": note, "tags": None if tags is None else list(tags)}
+        """Change what is given, and return the label.
+
+        Args:
+            name: The sweep.
+            owner: Whose it is.
+            note: A note.
+            tags: Tags.
+            created_at: When the sweep was created: what is said of another one of the name is forgotten. None: it is
+                changed, whichever it is said of.
+        """
+        given: dict[str, Any] = {
+            "owner": owner, "note": note, "tags": None if tags is None else list(tags), "created_at": created_at,
+        }  # fmt: skip
         values = {key: value for key, value in given.items() if value is not None}
         change = update(sweeps).where(sweeps.c.name == name).values(values or {"name": name})
         with self._engine.begin() as connection:
+            if created_at is not None:
+                is_of_another = func.abs(sweeps.c.created_at - created_at) > _SAME_S
+                connection.execute(delete(sweeps).where(sweeps.c.name == name, is_of_another))
             if connection.execute(change).rowcount == 0:
                 try:
                     # Of PostgreSQL's transactions an error would end the whole one.
@@ -69,3 +100,7 @@ class Labels:
         """Forget a sweep that is deleted."""
         with self._engine.begin() as connection:
             connection.execute(delete(sweeps).where(sweeps.c.name == name))
+
+
+def _label(row: RowMapping) -> Label:
+    return Label(row["owner"] or None, row["note"], tuple(row["tags"]), row["created_at"])

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from policies.envs.modules import allow_modules, allowed_again
-from policies.errors import CannotRunError, NotFoundError, SpecError
+from policies.errors import CannotRunError, NotFoundError, SpecError, TuneJobsError
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine, local_machine
 from tune_jobs.plan.points import num_trials_of
@@ -120,10 +120,16 @@ class Submitter:
         keyed = None if key is None else (key, submission.digest)
         if (known := self._known(owner, keyed)) is not None:
             return known, False
-        # To plan takes a while, which is spared.
-        check_room()
-        spec, plan = self._planned(submission)
-        name = self._free_name(submission, spec)
+        try:
+            # To plan takes a while, which is spared.
+            check_room()
+            spec, plan = self._planned(submission)
+            name = self._free_name(submission, spec)
+        except TuneJobsError:
+            # The request that this one repeats may have begun meanwhile: it is what has the name, or the room.
+            if (known := self._known(owner, keyed)) is not None:
+                return known, False
+            raise
         # Of many that come at once, each sees those before it.
         with self._beginning:
             if (known := self._known(owner, keyed)) is not None:
@@ -136,6 +142,13 @@ class Submitter:
             )
         if not is_new:
             return job, False
+        job = self._written(job, submission, spec, plan)
+        num_cpus = num_cpus_of(plan)
+        with self._noting(job.id, num_cpus):
+            return self._queue.created(job.id, num_cpus=num_cpus), True
+
+    def _written(self, job: Job, submission: Submission, spec: SweepSpec, plan: SweepPlan) -> Job:
+        """Write the sweep of a job, and return the job, which may have another name by then; it is forgotten if not."""
         try:
             while True:
                 sweep = self._storage.sweep(job.sweep)
@@ -156,9 +169,7 @@ class Submitter:
             with self._noting(job.id, None):
                 self._queue.forget(job.id)
             raise
-        num_cpus = num_cpus_of(plan)
-        with self._noting(job.id, num_cpus):
-            return self._queue.created(job.id, num_cpus=num_cpus), True
+        return job
 
     def settle(self) -> None:
         """Tell the queue what it could not be told before: which sweeps are written by now, and which never will be.

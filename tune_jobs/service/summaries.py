@@ -43,9 +43,13 @@ class SweepSummary(BaseModel):
 
 
 def summary(seen: Seen, label: Label, job: Job | None) -> SweepSummary:
-    """Return a sweep as a list shows it."""
+    """Return a sweep as a list shows it, with what the database has under its name."""
     status, record = seen.status, seen.status.sweep
     env = record.spec.get("env", {})
+    # Of an earlier sweep of this name, whose folder somebody removed, neither says anything of this one.
+    label = label.of(record.created_at)
+    if job is not None and job.is_of_former(record.created_at):
+        job = None
     return SweepSummary(
         name=record.name,
         state=status.state,

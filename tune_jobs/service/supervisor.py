@@ -389,7 +389,7 @@ def _is_over(job: Job | None, created_at: float) -> bool:
 
     A job that ended before the sweep was created was another's of the same name.
     """
-    return job is not None and job.outcome in ("stopped", "cancelled", "failed") and (job.ended_at or 0.0) >= created_at
+    return job is not None and job.outcome in ("stopped", "cancelled", "failed") and not job.is_of_former(created_at)
 
 
 def _wait_s(num_deaths: int) -> float:

@@ -68,7 +68,7 @@ class SweepView:
         written = {record.trial_id for record in changed}
         written |= {record.trial_id for record in seen.trials.records if record.status == "running"}
         rows = self.curves.update(sorted(written))
-        found: list[Change] = [*self._new_jobs()]
+        found: list[Change] = [*self._new_jobs(seen.status.sweep.created_at)]
         if not is_first:
             scores = seen.trials.scores
             found += [
@@ -89,8 +89,8 @@ class SweepView:
         self._trials = seen.trials
         return [record for record in seen.trials.records if before.get(record.trial_id) is not record]
 
-    def _new_jobs(self) -> Iterator[Change]:
-        jobs = {job.id: job for job in self._queue.jobs(sweep=self._name)}
+    def _new_jobs(self, created_at: float) -> Iterator[Change]:
+        jobs = {job.id: job for job in self._queue.jobs(sweep=self._name) if not job.is_of_former(created_at)}
         before, self._jobs = self._jobs, jobs
         for job in jobs.values():
             if before.get(job.id) != job:

@@ -71,8 +71,11 @@ sweeps = Table(
     Column("owner", String(100), nullable=False),
     Column("note", Text, nullable=False),
     Column("tags", JSON, nullable=False),
+    Column("created_at", Float),
 )
-"""What people say of sweeps; a sweep without a row is nobody's."""
+"""What people say of sweeps; a sweep without a row is nobody's.
+
+`created_at` says of which sweep of the name: when that one was created; null: an older version wrote the row."""
 
 tokens = Table(
     "tokens",

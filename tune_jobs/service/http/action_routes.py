@@ -116,10 +116,10 @@ def _enqueue(  # noqa: PLR0917 (all of them are one request)
     wait_for_nodes: float | None,
     more: Addition = _NOTHING,
 ) -> Job:
-    service.statuses.see(name)
+    created_at = service.statuses.see(name).status.sweep.created_at
     wait = waiting_arguments(service.config, wait_for_nodes)
     with service.adding:
-        jobs = service.queue.jobs(sweep=name)
+        jobs = [job for job in service.queue.jobs(sweep=name) if not job.is_of_former(created_at)]
         for job in jobs:
             if job.state not in ("waiting", "running"):
                 continue

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import AsyncIterator
 from typing import Annotated, cast
 
 from fastapi import Depends, HTTPException, Request
 
+from policies.errors import NotFoundError
 from tune_jobs.service.access.callers import RANK, Caller
 from tune_jobs.service.access.credentials import CHALLENGE
 from tune_jobs.service.access.refusal import RefusedError
@@ -44,6 +46,10 @@ def changer_of(request: Request, name: str) -> Caller:
     service = service_of(request)
     # What can be no name at all is nothing to ask a database for.
     label = service.labels.of(service.storage.sweep(name).name)
+    if caller.role != "admin" and label.created_at is not None:
+        # A damaged sweep doesn't say when it was created, and is still to be deleted by whose it is.
+        with contextlib.suppress(NotFoundError):
+            label = label.of(service.statuses.see(name).status.sweep.created_at)
     if not caller.may_change(label):
         raise HTTPException(403, f"Sweep {name} belongs to {label.owner or 'nobody'}; only they and admins change it.")
     return caller

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -9,6 +10,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 
 from analysis.records import TrialRecord
 from policies.errors import CheckpointError, NotFoundError
+from tune_jobs.service.access.callers import Caller
 from tune_jobs.service.http.caller import AChanger, ASubmitter, ATurn, TheService, set_audit_target
 from tune_jobs.service.http.models import (
     Change,
@@ -20,6 +22,7 @@ from tune_jobs.service.http.models import (
 )
 from tune_jobs.service.http.pages import MAX_CURSOR, page_of
 from tune_jobs.service.http.problems import NotNowError, TooManyError
+from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import NOTHING
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
@@ -78,15 +81,33 @@ def submit(
     )
     turn.end()
     set_audit_target(request, job.sweep)
-    # The request that made it may have been killed before it could say whose the sweep is.
-    if is_new or service.labels.of(job.sweep).owner is None:
-        service.labels.change(job.sweep, owner=caller.name, note=new.note, tags=new.tags)
+    _say_whose(service, caller, new, job, is_new=is_new)
     if is_new:
         service.supervisor.wake()
     else:
         response.status_code = 200
     response.headers["Location"] = f"/api/v1/sweeps/{job.sweep}"
     return Submitted(sweep=job.sweep, job=job)
+
+
+def _say_whose(service: Service, caller: Caller, new: NewSweep, job: Job, *, is_new: bool) -> None:
+    """Say whose the sweep of a job is.
+
+    The request that made it may have been killed before it could say so: one that repeats it does then.
+    """
+    if not is_new:
+        # Whoever is creating it says so once it is written.
+        if job.state == "creating":
+            return
+        known = service.labels.of(job.sweep)
+        # What was said of a sweep that was created before is said of another one, whose name was free again.
+        if known.owner is not None and (known.created_at is None or known.created_at >= job.submitted_at):
+            return
+    # Its folder may have been removed since, and its name be another one's.
+    with contextlib.suppress(NotFoundError):
+        created_at = service.storage.sweep(job.sweep).read_record().created_at
+        if is_new or (job.submitted_at <= created_at and not job.is_of_former(created_at)):
+            service.labels.change(job.sweep, owner=caller.name, note=new.note, tags=new.tags, created_at=created_at)
 
 
 def _check_room(service: Service, owner: str) -> None:
@@ -163,7 +184,7 @@ def spec(name: str, service: TheService) -> dict[str, Any]:
 @router.patch("/sweeps/{name}", responses=problems({409: "The priority is to change, and no job of the sweep waits."}))
 def change(name: str, to: Change, service: TheService, _: AChanger) -> SweepSummary:
     """Change the priority of what waits, the note or the tags."""
-    service.statuses.see(name)
+    created_at = service.statuses.see(name).status.sweep.created_at
     if to.priority is not None:
         if not service.queue.set_priority(name, to.priority):
             runs = bool(service.queue.jobs("running", sweep=name))
@@ -175,7 +196,7 @@ def change(name: str, to: Change, service: TheService, _: AChanger) -> SweepSumm
             )
         service.supervisor.wake()
     if to.note is not None or to.tags is not None:
-        service.labels.change(name, note=to.note, tags=to.tags)
+        service.labels.change(name, note=to.note, tags=to.tags, created_at=created_at)
     return summary_of(service, name)
 
 
