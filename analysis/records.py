@@ -241,6 +241,7 @@ class PriorPointRecord(Record):
     share: Annotated[float, Field(ge=0, le=1)] | None = Field(
         description="The share of its sweep's points that it is better than; null: a seed of it failed."
     )
+    env_steps: Count | None = Field(None, description="Mean env steps that a training takes; None: a former record.")
 
 
 class PriorRecord(Record):
@@ -261,6 +262,7 @@ class JobRecord(Record):
 
     id: str = Field(description="Its submission id.")
     address: str = Field(description="The address of the Jobs API that runs it; it never holds a token.")
+    place: str = Field("", description="The folder or URL of the sweep that it is of; empty in older records.")
 
 
 class SweepRecord(Record):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,19 @@ import pytest
 from compared_sweeps import LEFT, RIGHT, said, the_pair, wanted
 from fake_sweeps import RunCommand
 from scipy import stats
-from sweep_folders import make_sweep_folder
+from sweep_folders import extend_by_leaders, make_sweep_folder
 
 import tune_jobs
 from analysis.comparison.compare import compare
 from analysis.comparison.wording import fact_rows
+from analysis.exports.frames import SweepData
 from policies.errors import NotFoundError, SpecError
 from tests.narrowing import present
 from tune_jobs.cli.result_commands import OBJECTIVES
 from tune_jobs.spec.sections import ObjectiveSpec
+from tune_jobs.store.contract import Sweep
+from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.exports import sweep_data
 
 # -- statistics, against SciPy
 
@@ -267,6 +272,41 @@ def test_what_cannot_be_compared_is_refused(
     make_sweep_folder(tmp_path / "one")
     with pytest.raises(error, match=message):
         tune_jobs.compare(sources, storage=tmp_path)
+
+
+@pytest.mark.parametrize("place", ["copy", "other/one"])
+def test_a_copy_is_the_same_sweep_until_one_of_both_goes_on(tmp_path: Path, place: str) -> None:
+    store = make_sweep_folder(tmp_path / "one")
+    copied = SweepStore(shutil.copytree(store.folder, tmp_path / place))
+    (tmp_path / "linked").symlink_to(store.folder)
+    for pair in ([store.folder, copied.folder], [copied.folder, store.folder], [store.folder, tmp_path / "linked"]):
+        with pytest.raises(SpecError, match=r"are the same sweep"):
+            tune_jobs.compare(pair)
+    extend_by_leaders(copied)
+    found = tune_jobs.compare([store.folder, copied.folder])
+    assert [entry.trial_ids for entry in found.entries] == [("t0002", "t0003"), ("t0004", "t0005")]
+    assert "A and B have 4 trainings in common" in said(found)
+    # Of a setting that neither has trained on there is nothing more.
+    with pytest.raises(SpecError, match="seeds of the same setting"):
+        tune_jobs.compare([store.folder / "trials" / "t0000", copied.folder / "trials" / "t0001"])
+    apart = tune_jobs.compare([store.folder / "trials" / "t0000", copied.folder / "trials" / "t0005"])
+    assert "in common" not in said(apart)
+
+
+def test_a_sweep_that_goes_on_between_two_looks_at_it_is_the_same_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = make_sweep_folder(tmp_path / "one")
+
+    def look(sweep: Sweep) -> SweepData:
+        found = sweep_data(sweep)
+        trial = store.trial("t0000").read_record()
+        store.trial("t0000").write_record(trial.model_copy(update={"num_env_steps": trial.num_env_steps + 100}))
+        return found
+
+    monkeypatch.setattr("tune_jobs.sweeps.compare.sweep_data", look)
+    with pytest.raises(SpecError, match="one and one are the same sweep"):
+        tune_jobs.compare([store.folder, store.folder])
 
 
 def test_a_sweep_of_one_setting_has_nothing_to_compare_it_with(tmp_path: Path) -> None:

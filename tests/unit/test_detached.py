@@ -3,6 +3,7 @@
 import contextlib
 import json
 import shlex
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -17,10 +18,11 @@ from sweep_folders import make_sweep_folder
 from analysis.records import JobRecord
 from policies.errors import CannotRunError
 from tune_jobs.cli.commands import cli
+from tune_jobs.store.opening import is_same_place
 from tune_jobs.store.sweep_store import SweepStore
-from tune_jobs.sweeps import detached
+from tune_jobs.sweeps import detached, verbs
 from tune_jobs.sweeps.attach import _Look
-from tune_jobs.sweeps.own_job import environment_of, note_own_job
+from tune_jobs.sweeps.own_job import environment_of, job_of, note_own_job
 
 __all__ = ["head"]
 
@@ -77,7 +79,7 @@ def test_a_launch_leaves_a_sweep_and_a_job_that_resumes_it(head: Head, tmp_path:
     assert (told["sweep"], told["job"], told["address"]) == ("mine", sent["submission_id"], head.address)
     assert told["commands"]["attach"] == "tune-jobs attach mine --storage s"
     assert shlex.split(sent["entrypoint"]) == ["tune-jobs", "resume", str(store.folder), "--address", "auto"]
-    assert store.read_record().job == JobRecord(id=told["job"], address=head.address)
+    assert store.read_record().job == JobRecord(id=told["job"], address=head.address, place=str(store.folder))
     assert launch(head, "--detach", "--name", "patient", "--wait-for-nodes", "90").exit_code == 0
     sent_words = shlex.split(head.submitted[1]["entrypoint"])
     assert sent_words[3:] == ["--wait-for-nodes", "90.0", "--address", "auto"]
@@ -244,3 +246,106 @@ def test_status_of_a_sweep_whose_cluster_is_gone_is_told(head: Head, tmp_path: P
     done = run("status", "mine", "--storage", "s", "--json")
     assert done.exit_code == 0
     assert json.loads(done.stdout)["job"]["state"].startswith("not known")
+
+
+@pytest.fixture
+def original(head: Head, tmp_path: Path) -> SweepStore:
+    """A sweep whose job has not begun with it yet."""
+    store = make_sweep_folder(tmp_path / "s" / "mine")
+    job = JobRecord(id="mine-12ab34cd", address=head.address, place=store.place)
+    store.write_record(store.read_record().model_copy(update={"job": job}))
+    head.jobs[job.id] = {"status": "PENDING"}
+    return store
+
+
+# A record of before says nothing but the name.
+@pytest.mark.parametrize(("copy", "is_of_before"), [("s/copy", False), ("other/mine", False), ("s/copy", True)])
+def test_a_copied_sweep_is_not_run_by_the_originals_job(
+    head: Head, original: SweepStore, tmp_path: Path, copy: str, is_of_before: bool
+) -> None:
+    if is_of_before:
+        without_place(original)
+    copied = SweepStore(Path(shutil.copytree(original.folder, tmp_path / copy)))
+    with original.lock():
+        assert not verbs.stop(copied.folder)
+        assert not _Look(copied).goes_on()
+        assert head.stopped == []
+        told = run("status", copied.place)
+        assert (told.exit_code, "mine-12ab34cd" in told.stdout) == (0, False)
+        head.on_submit = lambda body: {"status": "SUCCEEDED"}
+        done = run("extend", copied.place, "--num-samples", "1", "--address", head.address, "--detach")
+        assert done.exit_code == 0, done.output
+    assert shlex.split(head.submitted[0]["entrypoint"])[:3] == ["tune-jobs", "extend", copied.place]
+    told_place = json.loads(head.submitted[0]["runtime_env"]["env_vars"]["TUNE_JOBS_JOB"])["place"]
+    assert told_place == copied.place
+
+
+@pytest.mark.parametrize("is_of_before", [False, True])
+def test_a_sweeps_own_job_is_found_by_any_path_to_it(
+    head: Head, original: SweepStore, tmp_path: Path, is_of_before: bool
+) -> None:
+    if is_of_before:
+        without_place(original)
+    (tmp_path / "linked").symlink_to(tmp_path / "s")
+    for number, place in enumerate((Path("s/mine"), tmp_path / "linked" / "mine", original.folder), start=1):
+        assert "mine-12ab34cd" in run("status", str(place)).stdout
+        assert verbs.stop(place)
+        assert head.stopped == ["mine-12ab34cd"] * number
+    again = run("extend", "s/mine", "--num-samples", "1", "--address", head.address, "--detach")
+    assert (again.exit_code, "is about to run sweep mine" in again.stderr) == (5, True)
+
+
+def test_the_job_of_a_folder_that_has_another_path_here_is_its_own(
+    head: Head, original: SweepStore, tmp_path: Path
+) -> None:
+    """It was moved, or the one who stops it reaches the same disk by another path than the one who launched it."""
+    moved = Path(shutil.move(original.folder, tmp_path / "elsewhere" / "mine"))
+    assert verbs.stop(moved)
+    assert head.stopped == ["mine-12ab34cd"]
+    assert not verbs.stop(shutil.move(moved, tmp_path / "renamed"))
+    assert head.stopped == ["mine-12ab34cd"]
+
+
+def test_a_driver_notes_of_which_sweep_its_job_is(
+    original: SweepStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "linked").symlink_to(tmp_path / "s")
+    job = JobRecord(id="mine-34cd56ef", address="http://head:8265", place=str(tmp_path / "linked" / "mine"))
+    monkeypatch.setenv("TUNE_JOBS_JOB", environment_of(job)["TUNE_JOBS_JOB"])
+    note_own_job(original)
+    # As `wait_until_begun` expects it.
+    assert original.read_record().job == job
+    assert job_of(original.read_record(), original.place) == job
+
+
+def without_place(store: SweepStore) -> None:
+    """Leave out of a record what former versions did not write."""
+    data = json.loads(store.record_path.read_text())
+    data["job"].pop("place", None)
+    store.record_path.write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "is_same"),
+    [
+        ("s3://b/s/mine", "s3://b/s/mine", True),
+        ("s3://b/s/mine?endpoint=http://h:9000", "s3://b/s/mine", True),
+        ("s3://b/s/mine?endpoint=http://h:9000&region=r", "s3://b/s/mine?region=r&endpoint=http://h:9000", True),
+        ("s3://b/s/mine?endpoint=http://h:9000", "s3://b/s/mine?endpoint=http://h:9001", False),
+        ("s3://b/s/mine", "s3://b/s/copy", False),
+        ("s3://b/s/mine", "gs://b/s/mine", False),
+        ("s3://b/s/mine", "/s/mine", False),
+        ("s3://", "s3://b/s/mine", False),
+        ("/not/here/mine", "/", False),
+        ("\0", "/", False),
+        ("/", "/.", True),
+    ],
+)
+def test_places_are_the_same_if_they_lead_to_the_same_files(one: str, other: str, is_same: bool) -> None:
+    assert (is_same_place(one, other), is_same_place(other, one)) == (is_same, is_same)
+
+
+def test_a_job_of_before_is_known_by_the_name_in_a_bucket_too(original: SweepStore) -> None:
+    record = original.read_record().model_copy(update={"job": JobRecord(id="mine-12ab34cd", address="http://head")})
+    assert job_of(record, "s3://b/s/mine") == record.job
+    assert job_of(record, "s3://b/s/copy") is None

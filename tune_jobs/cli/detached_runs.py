@@ -82,11 +82,14 @@ def refuse_dry_run_of_job(address: str | None, *, detach: bool) -> None:
 
 def job_facts(status: SweepStatus) -> dict[str, str] | None:
     """Return id, address and state of the job that drives a sweep or drove it last; None: no job did."""
-    job = status.sweep.job
-    if job is None:
+    if status.sweep.job is None or status.place is None:
         return None
     from tune_jobs.sweeps.detached import job_now, told_of
+    from tune_jobs.sweeps.own_job import job_of
 
+    job = job_of(status.sweep, status.place)
+    if job is None:
+        return None
     return {"id": job.id, "address": job.address, "state": told_of(job_now(job))}
 
 

@@ -23,8 +23,8 @@ def end_process(store: Sweep, last_words: str, exit_code: int) -> NoReturn:
     os._exit(exit_code)
 
 
-def close_run(store: Sweep, started: float | None = None) -> None:
-    """Write how the run ended that began at `started`; None: it had not begun."""
+def close_run(store: Sweep, ran_s: float = 0.0) -> None:
+    """Write how the run ended, which took so many seconds; 0: it had not begun."""
     interrupted = False
     for trial in store.read_trials():
         if trial.status not in FINISHED:
@@ -32,13 +32,12 @@ def close_run(store: Sweep, started: float | None = None) -> None:
             if trial.status == "running":
                 store.trial(trial.trial_id).write_record(transitions.paused(trial))
     record = store.read_record()
-    now = time.time()
     store.write_record(
         record.model_copy(
             update={
                 "state": "interrupted" if interrupted else "completed",
-                "ended_at": now,
-                "run_time_s": record.run_time_s + (0.0 if started is None else now - started),
+                "ended_at": time.time(),
+                "run_time_s": record.run_time_s + ran_s,
             }
         )
     )

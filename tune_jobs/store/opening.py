@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 from analysis.records import SweepRecord
+from policies.errors import SpecError
 from tune_jobs.store import probe
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Storage, Sweep
@@ -16,6 +17,7 @@ from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.urls import folder_of, is_url, name_of_place, outer_place
 
 __all__ = [
+    "is_same_place",
     "is_url",
     "open_storage",
     "open_sweep",
@@ -50,6 +52,25 @@ def open_sweep(place: str | Path) -> Sweep:
 
         return ObjectSweep(ObjectUrl.parse(str(place)))
     return SweepStore(folder_of(place))
+
+
+def is_same_place(one: str, other: str) -> bool:
+    """Whether two places are one: a folder also by a link to it, a URL with or without what says how it is reached."""
+    if one == other:
+        return True
+    try:
+        if not is_url(one) and not is_url(other):
+            return folder_of(one).samefile(folder_of(other))
+        return is_url(one) and is_url(other) and _is_same_url(ObjectUrl.parse(one), ObjectUrl.parse(other))
+    except (OSError, ValueError, SpecError):
+        # A folder of another machine, or a record's text that is no place.
+        return False
+
+
+def _is_same_url(one: ObjectUrl, other: ObjectUrl) -> bool:
+    # What only one of them says, the other takes from its environment.
+    both = one.settings.keys() & other.settings.keys()
+    return one.short == other.short and all(one.settings[name] == other.settings[name] for name in both)
 
 
 def others_write(place: str | Path) -> None:

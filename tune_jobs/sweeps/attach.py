@@ -23,6 +23,7 @@ from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
+from tune_jobs.sweeps.own_job import job_of
 from tune_jobs.sweeps.reached import reached_of
 
 _POLL_S = 0.5
@@ -107,7 +108,7 @@ class _Look:
         if self._store.is_driven():
             self._let_go_at = None
             return True
-        job = self._store.read_record().job if self._store.exists() else None
+        job = job_of(self._store.read_record(), self._store.place) if self._store.exists() else None
         if job is None:
             return False
         if self._let_go_at is None:

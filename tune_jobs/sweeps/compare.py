@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import string
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from analysis.comparison.compare import MAX_ENTRIES, Comparison, common_objective
 from analysis.comparison.compare import compare as compare_all
 from analysis.comparison.entries import Wanted, judged_alike, why_no_scores
 from analysis.exports.frames import ranked_settings
 from analysis.records import Objective
+from analysis.wording import counted
 from policies.arguments import PositiveInt, checked
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import is_same_place
 from tune_jobs.sweeps.exports import sweep_data
 from tune_jobs.sweeps.sources import find_source, find_trial
 from tune_jobs.sweeps.storage import local_path
@@ -74,12 +78,15 @@ def compared(
     if not sources:
         raise SpecError("Nothing was given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials.")
     wanted = _settings_of(*sources[0], objective, top) if len(sources) == 1 else [_wanted(*each) for each in sources]
-    _refuse_twice(wanted)
+    places = [sources[0][0].place] * len(wanted) if len(sources) == 1 else [store.place for store, _ in sources]
+    _refuse_twice(wanted, places)
     if not 2 <= len(wanted) <= MAX_ENTRIES:
         raise SpecError(
             f"{len(wanted)} things were given to be compared.", f"Give from 2 to {MAX_ENTRIES} sweeps or trials."
         )
-    return compare_all(wanted, objective), dict(zip(string.ascii_uppercase, wanted, strict=False))
+    named = dict(zip(string.ascii_uppercase, wanted, strict=False))
+    found = compare_all(wanted, objective)
+    return replace(found, notes=(*found.notes, *_told_of_copies(named, places))), named
 
 
 def _wanted(store: Sweep, trial_id: str | None) -> Wanted:
@@ -129,16 +136,53 @@ def _settings_of(store: Sweep, trial_id: str | None, objective: Objective | None
     return [_of(store, f"{store.name}/{item.trial_ids[0]}", item.point_index) for item in ranking[:top]]
 
 
-def _refuse_twice(wanted: Sequence[Wanted]) -> None:
-    """Refuse the same sweep or setting twice; a sweep with one of its own settings may be wanted."""
-    seen: dict[tuple[str, float, int | None], str] = {}
-    for item in wanted:
-        # A copy in another folder is the same sweep.
-        key = (item.sweep.name, item.sweep.created_at, item.point_index)
-        if key in seen:
-            what = "the same sweep" if item.point_index is None else "seeds of the same setting, or the same trial"
+def _refuse_twice(wanted: Sequence[Wanted], places: Sequence[str]) -> None:
+    """Refuse the same sweep or setting twice; a sweep with one of its own settings may be wanted.
+
+    A copy in another folder is the same sweep until one of both goes on.
+    """
+    for (one, at), (other, other_at) in itertools.combinations(zip(wanted, places, strict=True), 2):
+        if not _is_copied(one, other) or one.point_index != other.point_index:
+            continue
+        # One that runs has gone on between two looks at it.
+        if _trainings(one) == _trainings(other) or is_same_place(at, other_at):
+            what = "the same sweep" if one.point_index is None else "seeds of the same setting, or the same trial"
             raise SpecError(
-                f"{seen[key]} and {item.name} are {what}: there is nothing to compare.",
+                f"{one.name} and {other.name} are {what}: there is nothing to compare.",
                 "Name two different ones; `tune-jobs compare SWEEP` compares the settings of one sweep.",
             )
-        seen[key] = item.name
+
+
+def _told_of_copies(wanted: Mapping[str, Wanted], places: Sequence[str]) -> list[str]:
+    """Say where a sweep and a copy of it, one of which has gone on, have trainings in common."""
+    notes = []
+    for (one, at), (other, other_at) in itertools.combinations(zip(wanted, places, strict=True), 2):
+        if not _is_copied(wanted[one], wanted[other]) or is_same_place(at, other_at):
+            continue
+        if same := [each for each in _trainings(wanted[one]) & _trainings(wanted[other]) if each.num_env_steps]:
+            notes.append(
+                f"{one} and {other} have {counted(len(same), 'training')} in common, as one is of a copy of the "
+                "other's sweep: these are the same numbers twice, and the intervals take them for independent ones."
+            )
+    return notes
+
+
+def _is_copied(one: Wanted, other: Wanted) -> bool:
+    """Whether two are of one sweep, or of a copy of it, which has its name still."""
+    return (one.sweep.name, one.sweep.created_at) == (other.sweep.name, other.sweep.created_at)
+
+
+class _Training(NamedTuple):
+    """What changes of a trial when its sweep goes on."""
+
+    trial_id: str
+    status: str
+    num_env_steps: int
+
+
+def _trainings(item: Wanted) -> set[_Training]:
+    return {
+        _Training(trial.trial_id, trial.status, trial.num_env_steps)
+        for trial in item.data.trials
+        if item.point_index in (None, trial.point_index)
+    }

@@ -21,7 +21,7 @@ from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.create import remove_unless_it_waited, removed_if_not_begun, write_created
-from tune_jobs.sweeps.own_job import environment_of, version_here
+from tune_jobs.sweeps.own_job import environment_of, job_of, version_here
 from tune_jobs.sweeps.storage import stem_of, storage_place
 from tune_jobs.sweeps.travel import folder_to_send, packed
 
@@ -122,9 +122,10 @@ def go_on_detached(
     watch = f"Watch it with `tune-jobs attach {named}`, or end it with `tune-jobs stop {named}`."
     if store.is_driven():
         raise CannotRunError(f"Sweep {store.name} is being run by another process.", watch)
-    before = None if record.job is None else job_now(record.job)
-    if record.job is not None and before is not None and not before.has_ended:
-        raise CannotRunError(f"Job {record.job.id} at {record.job.address} is about to run sweep {store.name}.", watch)
+    known = job_of(record, store.place)
+    before = None if known is None else job_now(known)
+    if known is not None and before is not None and not before.has_ended:
+        raise CannotRunError(f"Job {known.id} at {known.address} is about to run sweep {store.name}.", watch)
     content = _modules_of_sweep(record.allowed_modules, None)
     with JobsApi(address) as api:
         api.ray_version()
@@ -197,7 +198,7 @@ def failure_of(store: Sweep, job: JobRecord, found: Job) -> TuneJobsError:
 
 def cancel_waiting(store: Sweep) -> bool:
     """End the job that is to run a sweep and has not begun with it; return whether there was one."""
-    job = store.read_record().job
+    job = job_of(store.read_record(), store.place)
     found = None if job is None else job_now(job)
     if job is None or found is None or found.has_ended:
         return False
@@ -236,7 +237,7 @@ def _waiting(wait_for_nodes: float) -> list[str]:
 
 
 def _new_job(store: Sweep, address: str) -> JobRecord:
-    return JobRecord(id=f"{store.name}-{secrets.token_hex(4)}", address=address)
+    return JobRecord(id=f"{store.name}-{secrets.token_hex(4)}", address=address, place=store.place)
 
 
 def _submit(

@@ -21,6 +21,7 @@ from tune_jobs.plan.engine_choice import PackPlan, may_pack
 from tune_jobs.plan.machine import Machine, local_machine, usable_cpus
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
+from tune_jobs.process.clock import passing_s
 from tune_jobs.process.interruption import current
 from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.address import check_address
@@ -290,7 +291,8 @@ def _run_trials(
     monitor, stack = shared.monitor, shared.stack
     if monitor is None:
         raise RuntimeError("A stage is run before it has a monitor.")
-    started = time.time()
+    # Not by the clock, which may be set back.
+    began_s = passing_s()
     with noted():
         if not shared.is_shown:
             monitor.phase = "starting Ray" if address is None else f"joining the Ray cluster at {address}"
@@ -339,7 +341,7 @@ def _run_trials(
                 monitor.phase = "ending Ray" if address is None else "leaving the Ray cluster"
                 # Done before Ray is shut down: if a part of Ray died, that takes long, and may end this process.
                 with current().shielded(), run.held(), _giving_way_to(sys.exception()):
-                    close_run(store, started)
+                    close_run(store, passing_s() - began_s)
 
 
 @contextlib.contextmanager

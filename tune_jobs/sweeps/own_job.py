@@ -1,4 +1,4 @@
-"""Know in a process that a Ray cluster runs as a job which job that is, and who asked for it."""
+"""Know in a process that a Ray cluster runs as a job which job that is and who asked for it; and whose job one is."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import json
 import os
 from importlib.metadata import PackageNotFoundError, version
 
-from analysis.records import JobRecord
+from analysis.records import JobRecord, SweepRecord
 from policies.errors import CannotRunError
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import is_same_place
+from tune_jobs.store.urls import is_url, name_of_place
 
 _VARIABLE = "TUNE_JOBS_JOB"
 
@@ -23,9 +25,27 @@ def version_here() -> str:
 
 def environment_of(job: JobRecord) -> dict[str, str]:
     """Return the environment variables of a job's process; everybody who reaches the cluster can read them."""
-    told = {"id": job.id, "address": job.address, "version": version_here()}
+    told = {"id": job.id, "address": job.address, "place": job.place, "version": version_here()}
     # A job that is ended from outside has three seconds for its last checkpoints otherwise.
     return {_VARIABLE: json.dumps(told), "RAY_JOB_STOP_WAIT_TIME_S": "60"}
+
+
+def job_of(record: SweepRecord, place: str) -> JobRecord | None:
+    """Return the job that drives a sweep, or drove it last; None: another process did.
+
+    The record of a copy names the original's job, which is none of the copy's: it would be ended with that.
+
+    Args:
+        record: The sweep's record.
+        place: Where the sweep is.
+    """
+    job = record.job
+    if job is None:
+        return None
+    if job.place and (is_url(job.place) or is_url(place) or os.path.lexists(job.place)):
+        return job if is_same_place(job.place, place) else None
+    # Moved since, known here by another path, or of before jobs had places: its id tells the name, see `detached`.
+    return job if job.id.rpartition("-")[0] == name_of_place(place) else None
 
 
 def note_own_job(store: Sweep) -> None:
@@ -43,7 +63,7 @@ def note_own_job(store: Sweep) -> None:
 def _own_job() -> JobRecord | None:
     try:
         told = json.loads(os.environ.get(_VARIABLE) or "null")
-        job = None if told is None else JobRecord(id=told["id"], address=told["address"])
+        job = None if told is None else JobRecord(id=told["id"], address=told["address"], place=told.get("place", ""))
     except (ValueError, TypeError, KeyError):
         # Somebody else's variable: this process is driven by nobody's job.
         return None

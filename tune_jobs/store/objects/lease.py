@@ -19,6 +19,7 @@ from typing import Any
 
 from policies.errors import CannotRunError
 from policies.parents import is_gone, this_process
+from tune_jobs.process.clock import passing_s
 from tune_jobs.store.objects.bucket import Bucket, ConflictError, Found, StorageError, Tag
 
 _BEAT_S = 4.0
@@ -171,7 +172,7 @@ def _is_here(holder: dict[str, Any]) -> bool | None:
 
 def _now() -> float:
     """Return seconds that go on while the machine sleeps, as they do for who watches it."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic()
+    return passing_s()
 
 
 class Beating:

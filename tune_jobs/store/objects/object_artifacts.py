@@ -23,6 +23,7 @@ from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Listed, Tag
 from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.objects.scratch import filling, make_local
 from tune_jobs.store.record_files import dump_sealed
 
 
@@ -40,7 +41,7 @@ class Artifacts:
     def _shared(self, folder: str, *, fetched: bool = True) -> Path:
         """Return the local folder of the winner or the report, with what the store has of it."""
         local = self._parts.shared() / folder
-        local.mkdir(parents=True, exist_ok=True)
+        make_local(local)
         if fetched:
             listed = self._parts.listed(f"{folder}/").items()
             present = {key.removeprefix(f"{folder}/"): item for key, item in listed}
@@ -139,7 +140,7 @@ class Artifacts:
         """Yield the path for each of the films of the present winner."""
         # Not where others look: those bring that folder to what the store has.
         made = self._parts.own() / "made" / f"films-{secrets.token_hex(4)}"
-        made.mkdir(parents=True)
+        make_local(made)
         shown = self.read_best().checkpoint
         self._parts.remove_record(f"{names.BEST_FOLDER}/{names.FILMS_RECORD}")
         paths = {film: made / name for film, name in names.FILMS.items()}
@@ -170,7 +171,9 @@ class Artifacts:
     def writing_report(self) -> Iterator[Path]:
         """Yield a local folder to write the report into, over the present one."""
         folder = self._parts.own() / "made" / f"report-{secrets.token_hex(4)}"
-        shutil.copytree(self._shared(names.REPORT_FOLDER), folder, ignore=shutil.ignore_patterns(".*"))
+        present = self._shared(names.REPORT_FOLDER)
+        with filling():
+            shutil.copytree(present, folder, ignore=shutil.ignore_patterns(".*"))
         yield folder
         files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
         page = folder / names.REPORT_PAGE
@@ -187,7 +190,8 @@ def _mark(path: Path, tag: Tag) -> None:
     """Note which content of an object a local file has."""
     found = path.stat()
     # Listings and answers to writes agree in the entity tag; not all of them have the version.
-    _marked(path).write_text(repr((tag[0], found.st_size, found.st_mtime_ns)), encoding="utf-8")
+    with filling():
+        _marked(path).write_text(repr((tag[0], found.st_size, found.st_mtime_ns)), encoding="utf-8")
 
 
 def _differs(path: Path, item: Listed) -> bool:

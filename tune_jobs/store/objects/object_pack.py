@@ -16,6 +16,7 @@ from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.owners import ObjectOwner
 from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.objects.scratch import make_local
 from tune_jobs.store.pack_contract import Assignment
 from tune_jobs.store.places import check_pack_id
 from tune_jobs.store.trial_contract import Ownership
@@ -114,7 +115,7 @@ class ObjectPack:
     def log_path(self) -> Path:
         """A file of this machine that the pack's process appends its output to."""
         folder = self._parts.shared() / names.PACKS_FOLDER
-        folder.mkdir(parents=True, exist_ok=True)
+        make_local(folder)
         return folder / f"{self.pack_id}.log"
 
     def begin_log(self) -> None:

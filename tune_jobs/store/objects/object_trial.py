@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
-from policies.errors import MALFORMED, CheckpointError, NotFoundError, TuneJobsError
+from policies.errors import MALFORMED, CannotRunError, CheckpointError, NotFoundError, TuneJobsError
 from policies.files import open_to_append
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
@@ -25,6 +25,7 @@ from tune_jobs.store.objects.bucket import Listed
 from tune_jobs.store.objects.logs import LogUploads
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.parts import Parts
+from tune_jobs.store.objects.scratch import filling, make_local
 from tune_jobs.store.objects.trial_state import TrialState
 from tune_jobs.store.places import check_trial_id, within
 from tune_jobs.store.results_file import ResultsFile, Scored
@@ -246,8 +247,9 @@ class ObjectTrial:
         if not folder.exists() and self._parts.bucket.fetch(f"{prefix}/{names.MANIFEST}", made / names.MANIFEST):
             for name in described_files(made):
                 self._parts.bucket.fetch(f"{prefix}/{name}", made / name)
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            made.rename(folder)
+            with filling():
+                folder.parent.mkdir(parents=True, exist_ok=True)
+                made.rename(folder)
         return folder
 
     def remove_copies(self, keep: Collection[int] = ()) -> None:
@@ -321,14 +323,14 @@ class ObjectTrial:
     def log_path(self) -> Path:
         """A file of this machine that the trial's process appends its output to."""
         folder = self._parts.shared() / names.TRIALS_FOLDER / self.trial_id
-        folder.mkdir(parents=True, exist_ok=True)
+        make_local(folder)
         return folder / names.TRIAL_LOG
 
     def write_log(self, text: str) -> None:
         """Append a line to the log, with the time and this process."""
         line = f"{time.strftime('%Y-%m-%d %H:%M:%S')} process {os.getpid()}: {text}\n"
         path = self.log_path
-        with open_to_append(path) as file:
+        with filling(), open_to_append(path) as file:
             file.write(line.encode(errors="backslashreplace"))
         if self._log_uploads is None:
             # Who says something of a trial does not wait for the store; of a log, nobody waits for the end.
@@ -359,7 +361,7 @@ class ObjectTrial:
     def forget_tally(self) -> None:
         """Delete the tally."""
         self._state.check()
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, CannotRunError):
             self.tally_path.unlink(missing_ok=True)
 
 

@@ -19,7 +19,7 @@ from tune_jobs.store.objects.bucket import Bucket, ConflictError, Found, Listed,
 from tune_jobs.store.objects.held import held
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import ObjectOwner
-from tune_jobs.store.objects.scratch import own_folder, shared_folder
+from tune_jobs.store.objects.scratch import filling, own_folder, shared_folder
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.record_files import dump, read_record
@@ -85,10 +85,11 @@ class Parts:
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
-        """Let errors of the block name the store and not this process's folder."""
+        """Let errors of what is read in the block name the store and not this process's folder."""
         try:
             yield
-        except TuneJobsError as error:
+        # Where a file of this machine cannot be written, its folder is what matters.
+        except (NotFoundError, StorageError) as error:
             local = re.compile(rf"{re.escape(str(self.own()))}(/[0-9a-f]{{8}}(?=/))?")
             message, hint = (local.sub(lambda _: self.bucket.url.short, text) for text in (error.message, error.hint))
             raise error.again(message, hint) from error.__cause__
@@ -114,6 +115,7 @@ class Parts:
         Raises:
             NotFoundError: There is none.
             CheckpointError: It is damaged, of a newer format, or was changed; the message names it.
+            CannotRunError: This machine's copy of it cannot be written.
         """
         data = self._pending.get(key)
         known = self._known.get(key)
@@ -126,10 +128,12 @@ class Parts:
                 raise NotFoundError(f"No {what} at {self.bucket.name_of(key)}.", hint)
         # By the same code as a file's.
         path = self.own() / key
-        with self._lock, self.named():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-            return read_record(path, kind, what, is_sealed=is_sealed)
+        with self._lock:
+            with filling():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(data)
+            with self.named():
+                return read_record(path, kind, what, is_sealed=is_sealed)
 
     def _is_of_snapshot(self, known: _Known) -> bool:
         return known.as_of is not None and known.as_of is self.snapshot
@@ -341,8 +345,7 @@ class Parts:
     def append(self, key: str, data: bytes) -> None:
         """Append to a file that only this process writes to; it is uploaded from time to time."""
         path = self.own() / "appended" / key
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open_to_append(path) as file:
+        with filling(), open_to_append(path) as file:
             file.write(data)
         job = "appended", str(path)
         self.jobs.add(job)

@@ -17,6 +17,7 @@ import shutil
 import stat
 import tempfile
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 
 from policies.errors import CannotRunError
@@ -27,6 +28,7 @@ from tune_jobs.store.objects.url import ObjectUrl
 VARIABLE = "TUNE_JOBS_SCRATCH"
 """Where these folders are; without it, in the system's folder for temporary files."""
 _PROCESS = "process"
+_HINT = f"Free space there, or set {VARIABLE} to another folder that can be written."
 
 
 def shared_folder(url: ObjectUrl) -> Path:
@@ -38,7 +40,7 @@ def shared_folder(url: ObjectUrl) -> Path:
     # Two storages of one name are two; the name is for whoever looks.
     key = hashlib.sha256(str(url).encode()).hexdigest()[:12]
     folder = _root() / f"{url.name or url.bucket}-{key}"
-    _make(folder)
+    make_local(folder)
     return folder
 
 
@@ -46,7 +48,7 @@ def shared_folder(url: ObjectUrl) -> Path:
 def _own(pid: int) -> Path:
     """Return a new folder of this process alone; `pid` is its id, as a forked process needs another."""
     folder = _root() / f"of-{pid}-{secrets.token_hex(4)}"
-    _make(folder)
+    make_local(folder)
     write_atomic(folder / _PROCESS, this_process())
     _remove_abandoned()
     atexit.register(_remove, folder, pid)
@@ -63,11 +65,33 @@ def own_folder(owner: object | None = None) -> Path:
         CannotRunError: It cannot be made.
     """
     folder = _own(os.getpid()) / secrets.token_hex(6)
-    _make(folder)
+    make_local(folder)
     if owner is not None:
         # All are removed at the end of the process, and a fork leaves its parent's alone.
         weakref.finalize(owner, _remove, folder, os.getpid()).atexit = False
     return folder
+
+
+@contextlib.contextmanager
+def filling() -> Iterator[None]:
+    """Say of which folders it is if a file of this machine cannot be written in the block; the store is not to blame.
+
+    Raises:
+        CannotRunError: It cannot be written, as the disk is full, say.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise CannotRunError(
+            f"Files of this machine cannot be written to {_place()}: {_reason(error)}.", _HINT
+        ) from error
+
+
+def _reason(error: OSError) -> str:
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
+        # Of a folder that is copied, what was wrong with each of its files.
+        return str(error.args[0][0][-1])
+    return error.strerror or str(error)
 
 
 def _remove(folder: Path, pid: int) -> None:
@@ -82,10 +106,14 @@ def _remove_abandoned() -> None:
                 shutil.rmtree(path, ignore_errors=True)
 
 
-def _root() -> Path:
+def _place() -> Path:
     given = os.environ.get(VARIABLE)
-    root = Path(given) if given else Path(tempfile.gettempdir()) / f"tune-jobs-{os.getuid()}"
-    _make(root)
+    return Path(given) if given else Path(tempfile.gettempdir()) / f"tune-jobs-{os.getuid()}"
+
+
+def _root() -> Path:
+    root = _place()
+    make_local(root)
     found = root.lstat()
     # In a folder for all, somebody else may have been there first.
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
@@ -93,11 +121,15 @@ def _root() -> Path:
     return root
 
 
-def _make(folder: Path) -> None:
+def make_local(folder: Path) -> None:
+    """Make a folder in one of these, if it does not exist, and those above it.
+
+    Raises:
+        CannotRunError: It cannot be made.
+    """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise CannotRunError(
-            f"The folder {folder} for files of this machine cannot be made: {error.strerror or error}.",
-            f"Set {VARIABLE} to a folder that can be written.",
+            f"The folder {folder} for files of this machine cannot be made: {error.strerror or error}.", _HINT
         ) from error

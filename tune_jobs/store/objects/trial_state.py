@@ -26,6 +26,7 @@ from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.result_chunks import ResultChunks
+from tune_jobs.store.objects.scratch import filling, make_local
 from tune_jobs.store.trial_contract import Ownership
 from tune_jobs.store.trial_store import TrialStore
 
@@ -161,7 +162,7 @@ class TrialState:
         """Return the local files of the trial, with the results that there are now."""
         if not self._is_writing:
             self._look()
-        self.folder().mkdir(parents=True, exist_ok=True)
+        make_local(self.folder())
         return TrialStore(self.folder().parent.parent, self._trial_id)
 
     def has_results(self) -> bool:
@@ -241,7 +242,7 @@ class TrialState:
         present = path.read_bytes() if path.exists() else None
         if present is not None and content.startswith(present):
             # The same file grows, so that who has read its beginning reads on.
-            with path.open("ab") as file:
+            with filling(), path.open("ab") as file:
                 file.write(content[len(present) :])
         else:
             write_atomic(path, content)
