@@ -96,6 +96,58 @@ def test_what_acts_only_with_a_value_inside_a_range_is_not_refused(batch: dict[s
         notes(**DQN, num_samples=20, space=space)
 
 
+ONE_UPDATE = {"num_epochs": 1, "train_batch_size": 1024, "minibatch_size": 1024}
+CLIP = {"clip_param": {"uniform": [0.1, 0.3]}}
+BETWEEN: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
+    # 1,024 is no multiple of 3, 5, 6 and 7.
+    "num_envs of ppo": (PPO, ONE_UPDATE, {**CLIP, "num_envs": {"randint": [1, 9]}}),
+    # With 64 there is one update, with 128 the schedule is over before the first.
+    "train_batch_size": (
+        PPO,
+        {"num_epochs": 1, "minibatch_size": 64, "num_envs": 1, "clip_decay_steps": 128, "clip_param_final": 0.1},
+        {**CLIP, "train_batch_size": {"randint": [64, 129]}},
+    ),
+    # Three make 6 env steps in a phase, with two updates: one each 3 env steps.
+    "num_envs of dqn": (
+        DQN,
+        {"train_freq": 4, "updates_per_env_step": 0.25},
+        {"target_update_freq": {"choice": [3, 4]}, "num_envs": {"randint": [1, 5]}},
+    ),
+    # So do two where train_freq is 5 or 6.
+    "train_freq": (
+        DQN,
+        {"num_envs": 2, "updates_per_env_step": 0.25},
+        {"target_update_freq": {"choice": [2, 3]}, "train_freq": {"qrandint": [4, 8, 2]}},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("search", ["random", "gp"])
+@pytest.mark.parametrize("case", BETWEEN)
+def test_what_acts_only_with_a_step_between_the_ends_of_a_range_is_not_refused(case: str, search: str) -> None:
+    fields, fixed, space = BETWEEN[case]
+    told = "\n".join(notes(**fields, hyperparams=fixed, space=space, search=search, num_samples=20))
+    assert f"space.{next(iter(space))} can't act: " not in told
+
+
+@pytest.mark.parametrize("most", [7, 8])
+def test_with_too_many_steps_to_look_at_nothing_is_refused(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four numbers of envs with two values, that divide 1,024 all."""
+    monkeypatch.setattr("tune_jobs.plan.idle_notes._MOST_COMBINATIONS", most)
+    fields = {**PPO, "hyperparams": ONE_UPDATE, "space": {**CLIP, "num_envs": {"power_of_two": [1, 8]}}}
+    if most == 7:
+        assert any(note.startswith("space.clip_param can't act in ") for note in notes(**fields, num_samples=5))
+    else:
+        with pytest.raises(SpecError, match=r"space\.clip_param is searched, but can't act.*policy that sampled"):
+            notes(**fields, num_samples=5)
+
+
+def test_a_range_of_more_steps_than_anybody_can_list_is_not_listed() -> None:
+    space = {"target_update_freq": {"choice": [1, 2]}, "train_freq": {"lograndint": [1, 10**12]}}
+    told = notes(**DQN, hyperparams={"num_envs": 2, "updates_per_env_step": 0.25}, space=space, num_samples=20)
+    assert not any("space.target_update_freq can't act: " in note for note in told)
+
+
 def test_several_are_told_at_once() -> None:
     space = grid(kl_target=[0.01, 0.1], kl_coeff=[0.1, 0.2], lr=[1e-3, 1e-4])
     with pytest.raises(SpecError, match=r"space\.kl_target, space\.kl_coeff are searched") as refused:

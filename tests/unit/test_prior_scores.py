@@ -1,5 +1,6 @@
 """By what an earlier sweep's points are ranked, which of them count, and what a plan says of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,15 @@ from test_prior import begun, make_spec, valley, write_earlier
 from test_search_methods import record
 
 from analysis.objectives import score_of
-from analysis.records import IterationRecord, PriorPointRecord, PriorRecord
+from analysis.records import IterationRecord, PriorPointRecord, PriorRecord, TrialRecord
+from policies import random_streams
 from tests.narrowing import present
-from tune_jobs.search.prior import prior_notes, prior_record
+from tune_jobs.search import proposal
+from tune_jobs.search.history import KnownPoint
+from tune_jobs.search.prior import prior_notes, prior_record, weighed_prior
+from tune_jobs.search.proposal import propose_point
+from tune_jobs.search.two_objectives import weighed
+from tune_jobs.search.warped import rank_of
 from tune_jobs.store.sweep_store import SweepStore
 
 OBJECTIVES: list[dict[str, Any]] = [{"type": "area"}, {"type": "steps_to_threshold", "threshold": 400.0}]
@@ -115,3 +122,89 @@ def test_a_note_says_that_no_model_will_propose_anything(changes: dict[str, Any]
     notes = prior_notes(spec, [PriorRecord(sweep="first", env_id=spec.env.id, points=points, num_ended=2)])
     assert any("All points will be random" in note for note in notes) is are_all_random
     assert prior_notes(spec, []) == ()
+
+
+LENGTHS = [10_000, 20_000, 30_000, 40_000, 50_000]
+LENGTH = "stop.num_env_steps"
+COSTLY: dict[str, Any] = {
+    "space": {LENGTH: {"choice": LENGTHS}}, "objective": ["return", "env_steps"], "search": "gp", "prior": "first",
+}  # fmt: skip
+OF_THE_COST, OF_THE_SCORE = 0.1, 0.9
+"""The largest weight of the score where nearly the cost alone counts, and the least where the score does."""
+
+
+def index_with(low: float, high: float) -> int:
+    """The index of a point for which the score has such a weight."""
+    return next(index for index in range(200) if low < random_streams.objective_weights(0, index).random() < high)
+
+
+def longer_is_better(*numbers: int, per_step: float = 0.01) -> list[TrialRecord]:
+    """Trials of each of the lengths, of which the longest scores most."""
+    return [
+        record(place, {LENGTH: LENGTHS[number]}, per_step * LENGTHS[number], steps=LENGTHS[number] + 100)
+        for place, number in enumerate(numbers)
+    ]
+
+
+def order_of(prior: PriorRecord) -> list[int]:
+    scored = sorted((present(item.share), item.point[LENGTH]) for item in prior.points if item.share is not None)
+    return [LENGTHS.index(length) for _, length in scored]
+
+
+def test_by_score_and_cost_an_earlier_sweeps_points_are_ordered_as_the_own_ones_are() -> None:
+    spec = make_spec(**COSTLY)
+    failed = record(5, {LENGTH: LENGTHS[0]}, status="failed")
+    prior = prior_record(spec, "first", spec, [*longer_is_better(0, 1, 2, 3, 4), failed])
+    assert [item.env_steps for item in prior.points[:-1]] == [length + 100 for length in LENGTHS]
+    assert order_of(prior) == [0, 1, 2, 3, 4]
+    own = [KnownPoint({LENGTH: length}, (length / 7,), (length,)) for length in LENGTHS]
+    for index in range(30):
+        made = weighed_prior(prior, index, seed=0)
+        told = weighed(own, index, seed=0)
+        assert order_of(made) == sorted(range(5), key=lambda number: present(told[number].score))
+        assert sorted(present(item.share) for item in made.points[:-1]) == [item.share for item in prior.points[:-1]]
+        assert made.points[-1] == prior.points[-1]
+    assert order_of(weighed_prior(prior, index_with(0.0, OF_THE_COST), seed=0)) == [4, 3, 2, 1, 0]
+    assert order_of(weighed_prior(prior, index_with(OF_THE_SCORE, 1.0), seed=0)) == [0, 1, 2, 3, 4]
+
+
+def test_points_that_are_alike_in_score_and_cost_share_their_place() -> None:
+    points = [
+        PriorPointRecord(point={LENGTH: LENGTHS[number]}, share=share, env_steps=steps)
+        for number, (share, steps) in enumerate([(0.2, 10), (0.5, 30), (0.5, 30), (0.8, 40)])
+    ]
+    prior = PriorRecord(sweep="first", env_id="CartPole-v1", points=tuple(points))
+    made = weighed_prior(prior, index_with(0.0, OF_THE_COST), seed=0)
+    assert [item.share for item in made.points] == pytest.approx([0.8, 0.5, 0.5, 0.2])
+    assert weighed_prior(prior.model_copy(update={"points": ()}), 0, seed=0).points == ()
+
+
+def test_where_a_former_record_tells_no_costs_the_scores_alone_order_its_points() -> None:
+    points = tuple(PriorPointRecord(point={LENGTH: length}, share=length / 1e5) for length in LENGTHS)
+    prior = PriorRecord(sweep="first", env_id="CartPole-v1", points=points)
+    assert weighed_prior(prior, index_with(0.0, OF_THE_COST), seed=0) is prior
+    one = points[0].model_copy(update={"env_steps": 9})
+    mixed = prior.model_copy(update={"points": (one, *points[1:])})
+    assert weighed_prior(mixed, index_with(0.0, OF_THE_COST), seed=0) is mixed
+
+
+def test_a_model_that_is_told_of_the_cost_learns_what_an_earlier_sweep_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first points of the earlier sweep and of this one are the same, and are told as equal."""
+    told: list[Sequence[KnownPoint]] = []
+
+    def ask(method: str, space: Any, known: Sequence[KnownPoint], *_: Any, **__: Any) -> dict[str, Any]:
+        told.append(known)
+        return {LENGTH: LENGTHS[0]}
+
+    monkeypatch.setattr(proposal, "next_point", ask)
+    spec = make_spec(**COSTLY, seed=0)
+    prior = prior_record(spec, "first", spec, longer_is_better(0, 1, 2, 3, 4))
+    records = longer_is_better(0, 1, 2, 3, 4, 0, 1, 2, 3, 4, per_step=3.0)
+    for index in (index_with(0.0, OF_THE_COST), index_with(OF_THE_SCORE, 1.0)):
+        propose_point(spec, records, index, lambda _: None, [prior])
+        order = [[item.point[LENGTH] for item in sorted(told[-1][begin : begin + 5], key=rank_of)] for begin in (0, 5)]
+        assert order[0] == order[1]
+    assert order[0] == LENGTHS
+    # Who asks for the score alone learns of no cost.
+    propose_point(make_spec(**{**COSTLY, "objective": "final"}), records, 0, lambda _: None, [prior])
+    assert [item.point[LENGTH] for item in sorted(told[-1][:5], key=rank_of)] == LENGTHS

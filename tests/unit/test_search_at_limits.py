@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from tune_jobs.search.coordinates import Cube
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.proposal import next_point
 from tune_jobs.search.two_objectives import weighed
+from tune_jobs.search.warped import warped
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
@@ -105,6 +107,41 @@ def test_scores_at_both_ends_of_what_a_float_can_be_are_told_apart() -> None:
     found = [item.score for item in weighed(known, 0, seed=0)]
     assert all(score is not None and np.isfinite(score) for score in found)
     assert found[0] > found[1] > found[2]  # type: ignore[operator]
+
+
+WIDE = [
+    [(-1.7e308,), (1.7e308,), (-1.6e308,), (1.6e308,), (-1.5e308,)],
+    [(1.7e308, 1.7e308), (-1.7e308, -1.7e308), (3.0, 4.0), (-5.0, 1.0), (0.0, 2.0)],
+]
+
+
+@pytest.mark.parametrize("scores", WIDE)
+def test_a_model_is_told_finite_scores_in_their_order_where_sums_and_differences_are_not(
+    scores: list[tuple[float, ...]],
+) -> None:
+    points = [draw_point(SPACE, index, 0) for index in range(len(scores))]
+    known = [KnownPoint(point, each) for point, each in zip(points, scores, strict=True)]
+    means = [each[0] / 2 + each[-1] / 2 for each in scores]
+    assert [item.score for item in known] == means
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        told = warped(known)
+    assert all(np.isfinite(values).all() for values in told)
+    assert np.argsort(told.scores).tolist() == np.argsort(means).tolist()
+
+
+@pytest.mark.parametrize("scores", WIDE)
+def test_the_forest_proposes_a_point_after_scores_at_both_ends(scores: list[tuple[float, ...]]) -> None:
+    pytest.importorskip("sklearn")
+    points = [draw_point(SPACE, index, 0) for index in range(len(scores))]
+    known = [KnownPoint(point, each) for point, each in zip(points, scores, strict=True)]
+    found = [next_point("forest", SPACE, known, index, seed=0, num_startup_trials=4) for index in range(5, 10)]
+    assert all(point.keys() == SPACE.keys() for point in found)
+
+
+def test_the_means_of_ordinary_scores_are_their_sum_by_their_number_to_the_bit() -> None:
+    seeds = (0.1, 0.1, 0.1)
+    assert KnownPoint({}, seeds).score == sum(seeds) / 3 != sum(score / 3 for score in seeds)
 
 
 def test_the_words_of_optuna_are_as_loud_as_before() -> None:

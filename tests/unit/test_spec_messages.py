@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+import yaml
 from pydantic import BaseModel
 from spec_errors import MINIMAL, write
 
@@ -221,9 +222,12 @@ def test_a_dotted_key_of_the_space_is_written_with_its_domain_in_braces(
     assert problem_with({**MINIMAL, **followed}) is None
 
 
+IN_QUOTES = "put the name in quotes as you wrote it, '...', and on a command line in two pairs, \"'...'\""
+
+
 @pytest.mark.parametrize("prior", [2024, [2024]])
 def test_the_name_of_a_sweep_that_is_a_number_is_put_in_quotes(tmp_path: Path, prior: Any) -> None:
-    told = "2024 is a number: put it in quotes, '2024', and on a command line in two pairs, \"'2024'\""
+    told = f"is read as the number 2024: {IN_QUOTES}"
     assert problem_with({**MINIMAL, "name": 2024}) == f"sweep: name: {told}"
     assert load_spec(write(tmp_path, "env: CartPole-v1\nalgorithm: ppo\nname: '2024'\n")).name == "2024"
     # The shell has taken a pair of them.
@@ -233,6 +237,28 @@ def test_the_name_of_a_sweep_that_is_a_number_is_put_in_quotes(tmp_path: Path, p
     searched = {**MINIMAL, "search": "gp", "num_samples": 12, "space": {"lr": {"uniform": [0.1, 0.2]}}}
     assert told in present(problem_with({**searched, "prior": prior}))
     assert load_spec({**searched, "prior": "2024"}).prior == ("2024",)
+
+
+@pytest.mark.parametrize("written", ["1.10", "2024_01", "1e5", "0x10", "1e30"])
+def test_no_other_name_is_told_for_one_that_is_read_as_a_number(tmp_path: Path, written: str) -> None:
+    """The number's own text, such as 1.1 for 1.10, would name another sweep."""
+    searched = {**MINIMAL, "search": "gp", "num_samples": 12, "space": {"lr": {"uniform": [0.1, 0.2]}}}
+    number = float(written) if "x" not in written else int(written, 16)
+    for field, value in (("name", written), ("prior", written), ("prior", f"[first, {written}]")):
+        file = write(tmp_path, yaml.safe_dump(searched) + f"{field}: {value}\n")
+        for source, overrides in ((searched, [f"{field}={value}"]), (file, [])):
+            with pytest.raises(SpecError) as caught:
+                load_spec(source, overrides)
+            (line,) = (line for line in caught.value.message.splitlines() if "is read as" in line)
+            read, _, advice = line.partition(": is read as the number ")[2].partition(": ")
+            assert advice.removesuffix(" (from --set)") == IN_QUOTES
+            assert float(read) == number
+        quoted = value.replace(written, f"'{written}'")
+        for source, overrides in (
+            (searched, [f"{field}={quoted}"]),
+            (write(tmp_path, yaml.safe_dump(searched) + f"{field}: {quoted}\n"), []),
+        ):
+            assert written in (getattr(load_spec(source, overrides), field) or ())
 
 
 @pytest.mark.parametrize("name", [-1, True])

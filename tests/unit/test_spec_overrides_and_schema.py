@@ -155,6 +155,25 @@ def test_bad_overrides(override: str, part: str) -> None:
     assert part in caught.value.message
 
 
+@pytest.mark.parametrize("text", ["#ff0000", " # red", "#it's"])
+def test_a_value_that_is_only_a_comment_is_refused_with_the_quotes_that_it_needs(text: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        load_spec(MINIMAL, [f"env.args.color={text}"])
+    written = text.strip()
+    quoted = f"'{written}'".replace("t's", "t''s")
+    assert caught.value.message == f"--set env.args.color={text}: {written} is a comment in YAML, so there is no value"
+    assert f'put it in quotes, {quoted}, and on a command line in two pairs, "{quoted}".' in caught.value.hint
+    assert load_spec(MINIMAL, [f"env.args.color={quoted}"]).env.args == {"color": written}
+
+
+def test_null_and_nothing_are_no_comments() -> None:
+    base = {**MINIMAL, "env": {"id": "CartPole-v1", "args": {"color": "red"}}}
+    assert load_spec(base, ["env.args.color=null"]).env.args == {"color": None}
+    assert load_spec(base, ["env.args.color="]).env.args == {}
+    # What is read from a file may begin with one.
+    assert load_spec(base, ["env.args.color=# of the cart\nblue"]).env.args == {"color": "blue"}
+
+
 def test_a_problem_says_that_it_came_from_set() -> None:
     message = errors(num_samples=0, overrides=["seed=-1"])
     lines = message.splitlines()

@@ -105,6 +105,20 @@ def test_who_migrates_is_not_changed_at_the_same_comparison_itself() -> None:
     assert not {one.weights_of for one in moved(0, fast, slow).values()} & changed
 
 
+@pytest.mark.parametrize(
+    ("number", "fraction", "worst"),
+    [
+        # Their products are a little more than 7 in floats.
+        (25, 0.28, 7), (50, 0.14, 7), (100, 0.07, 7),
+        (100, 0.29, 29), (100, 0.071, 8), (5, 0.25, 2), (5, 0.5, 2), (4, 0.25, 1), (8, 1e-12, 1), (1, 0.5, 0),
+    ],
+)  # fmt: skip
+def test_of_a_share_that_is_a_whole_number_of_trials_there_are_as_many(
+    number: int, fraction: float, worst: int
+) -> None:
+    assert num_worst(number, fraction) == worst
+
+
 # -- the sweep file
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import os
 import sys
 import tempfile
@@ -31,12 +32,21 @@ _UNCHANGED = {
     "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
     "inject": "No trial had begun, and nothing was changed.",
 }
-_JSON, DEBUG = "tune_jobs.json", "tune_jobs.debug"
+_JSON, _JSON_NAMED, DEBUG = "tune_jobs.json", "tune_jobs.json_named", "tune_jobs.debug"
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 class CommandGroup(click.Group):
     """A group whose commands end with a clear message and the right exit code, never with a traceback."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the words before the command, and note whether --json is among all of them."""
+        ctx.meta[_JSON_NAMED] = "--json" in itertools.takewhile(lambda word: word != "--", args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.UsageError as error:
+            _print_json_of_click(ctx, error)
+            raise
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command; docs/design.md lists the exit codes."""
@@ -46,8 +56,7 @@ class CommandGroup(click.Group):
             raise
         except click.ClickException as error:
             told = self._placed(error, ctx.invoked_subcommand)
-            if ctx.meta.get(_JSON):
-                _print_json_error(told.format_message(), "", told.exit_code)
+            _print_json_of_click(ctx, told)
             raise told from None
         except KeyboardInterrupt as interruption:
             hint = _hint_after(interruption, ctx.invoked_subcommand or "")
@@ -96,6 +105,12 @@ def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) ->
     click.echo(f"error: {message}" + (f"\n{hint}" if hint else ""), err=True)
     if ctx.meta.get(_JSON):
         _print_json_error(message, hint, exit_code)
+
+
+def _print_json_of_click(ctx: click.Context, error: click.ClickException) -> None:
+    # Of words that can't be parsed, an option may be unread, or another have taken it as its value.
+    if ctx.meta.get(_JSON) or (isinstance(error, click.UsageError) and ctx.meta[_JSON_NAMED]):
+        _print_json_error(error.format_message(), "", error.exit_code)
 
 
 def _print_json_error(message: str, hint: str, exit_code: int) -> None:

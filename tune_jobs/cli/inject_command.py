@@ -33,7 +33,7 @@ def inject(
 
 
 def _point_of(assignments: Sequence[str]) -> dict[str, Any]:
-    from tune_jobs.spec.yaml import parse_yaml
+    from tune_jobs.spec.yaml import parse_value
 
     point: dict[str, Any] = {}
     for assignment in assignments:
@@ -43,5 +43,5 @@ def _point_of(assignments: Sequence[str]) -> dict[str, Any]:
             raise SpecError(f"{shown}: this is not a name and a value.", "Write NAME=VALUE, such as lr=3e-4.")
         if name in point:
             raise SpecError(f"{shown}: {name} has a value already.", "Give each name once.")
-        point[name] = parse_yaml(text, shown)
+        point[name] = parse_value(text, shown)
     return point

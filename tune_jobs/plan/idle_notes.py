@@ -33,6 +33,8 @@ _MOST_COMBINATIONS = 20_000
 """The most combinations of other searched values that are checked; with more, a search is not refused."""
 _MOST_NAMED = 8
 """The most points that a note lists by number; more are counted."""
+_DIVIDED_BY_NUM_ENVS = {"ppo": "train_batch_size", "dqn": "train_freq"}
+"""What rules divide by num_envs: whether such a rule holds may change with every step of either."""
 _LEAST_SHARE = 0.1
 """The share of the points from which on a note says that values of a range act alike."""
 
@@ -133,7 +135,7 @@ def _place(spec: SweepSpec, name: str) -> str:
 
 
 def _values_of(domain: Domain) -> list[Any]:
-    """Return values that represent a domain; a rule changes at most once between the ends of a range."""
+    """Return values that represent a domain: most rules change at most once between the ends of a range."""
     if isinstance(domain, Listed):
         return list(domain.values)
     if isinstance(domain, Layers):
@@ -165,12 +167,46 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
         return None  # it is switched off
     spec = points.spec
     rules = [rule for rule in RULES[spec.algorithm][name] if is_search or not (rule.of_value or rule is NO_UPDATE)]
+    if not rules:
+        return None
     reads = {read for rule in rules for read in rule.reads if read in spec.space}
     related = {other: spec.space[other] for other in spec.space if other in _with_conditions_of(spec, reads | {name})}
     others = {read: _values_of(domain) + _named(related, read) for read, domain in related.items() if read != name}
     others = {read: list({json.dumps(value): value for value in values}.values()) for read, values in others.items()}
-    if not rules or math.prod(map(len, others.values())) * len(own) > _MOST_COMBINATIONS:
-        return None
+    why = _rules_that_hold(points, name, own, rules, others=others)
+    if any("num_envs" in rule.reads for rule in why):
+        divided = [read for read in ("num_envs", _DIVIDED_BY_NUM_ENVS[spec.algorithm]) if read in others]
+        steps = {read: _every_step(domain) for read in divided if isinstance(domain := related[read], Range)}
+        why = _rules_that_hold(points, name, own, rules, others={**others, **steps})
+    # Without a reason there were no values with which it acts.
+    return "; or ".join(why.values()) or None
+
+
+def _every_step(domain: Range) -> list[Any]:
+    """Return all values of a range of steps, or more than are checked if it has more."""
+    first, last = map(int, domain.codes)
+    return [domain.of_code(code) for code in range(first, min(last, first + _MOST_COMBINATIONS) + 1)]
+
+
+def _rules_that_hold(
+    points: _Points, name: str, own: Sequence[Any], rules: Sequence[Rule], *, others: Mapping[str, Sequence[Any]]
+) -> dict[Rule, str]:
+    """Return the rules by which a hyperparameter is idle with each combination of other values, with their reasons.
+
+    Args:
+        points: The sweep's points.
+        name: The hyperparameter's name.
+        own: Its values.
+        rules: Those that may hold.
+        others: Values of what these read.
+
+    Returns:
+        Nothing if it acts with some of the values, or if they are too many to tell.
+    """
+    if math.prod(map(len, others.values())) * len(own) > _MOST_COMBINATIONS:
+        return {}
+    spec = points.spec
+    related = {other: domain for other, domain in spec.space.items() if other in others or other == name}
     base, conditions = points.known[0][1], Conditions(related)
     why: dict[Rule, str] = {}
     for combination in itertools.product(*others.values()):
@@ -182,14 +218,13 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
             given = {other: given[other] if other in acting else spec.value_without(other) for other in given}
         found = [_first_rule(points, rules, base.model_copy(update={**given, name: value})) for value in own]
         if any(one is None for one in found):
-            return None
+            return {}
         classes = {rule for rule, _ in filter(None, found) if rule.of_value}
         if len(classes) > 1:  # values of different classes act differently
-            return None
+            return {}
         for rule, reason in filter(None, found):
             why.setdefault(rule, reason)
-    # Without a reason there were no values with which it acts.
-    return "; or ".join(why.values()) or None
+    return why
 
 
 def _with_conditions_of(spec: SweepSpec, names: Iterable[str]) -> set[str]:

@@ -14,8 +14,7 @@ from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, PPOHyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.plan.estimates import iteration_env_steps
-from tune_jobs.spec.domains import Domain, Grid, Listed
-from tune_jobs.spec.draws import draw_points, num_points
+from tune_jobs.spec.draws import draw_points, num_different, num_points
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.training_length import hyperparams_in
@@ -45,9 +44,9 @@ def repeated_points_notes(spec: SweepSpec) -> list[str]:
         return [f"{repeats}; seeds_per_point does that and averages over the seeds."]
     again = "; seeds_per_point trains each again, and averages over the seeds."
     num_tried = num_points_of(spec)
-    num_different = _num_different(spec.space, num_tried)
-    if num_different is not None and num_different < num_tried:
-        different = counted(num_different, "different point")
+    number = num_different(spec.space, num_tried)
+    if number is not None and number < num_tried:
+        different = counted(number, "different point")
         return [f"The space has {different}, so some of the {num_tried} that num_samples gives are the same{again}"]
     if spec.search.type != "random" or spec.num_samples == 1 or not any(item.when for item in spec.space.values()):
         return []
@@ -56,15 +55,6 @@ def repeated_points_notes(spec: SweepSpec) -> list[str]:
     fixed = sum(not any(spec.space[name].is_random for name in point) for point in combinations)
     without = f"No random domain acts in {fixed:,} of the {counted(len(combinations), 'combination')} of grids"
     return [f"{without}, so num_samples {spec.num_samples} repeats what has them{again}"] if fixed else []
-
-
-def _num_different(space: Mapping[str, Domain], most: int) -> int | None:
-    """Return the number of different points of a space, or `most` or more where there are more; None: it has ranges."""
-    listed = {name: domain for name, domain in space.items() if isinstance(domain, Listed)}
-    if len(listed) < len(space):
-        return None
-    grids = {name: Grid(grid=domain.values, when=domain.when) for name, domain in listed.items()}
-    return num_points(grids, 1, most=most)
 
 
 def num_trials_of(

@@ -52,7 +52,11 @@ class KnownPoint:
     def score(self) -> float | None:
         """The mean over its seeds; None: it has none, or one of them failed."""
         known = [score for score in self.scores if score is not None]
-        return sum(known) / len(known) if known and len(known) == len(self.scores) else None
+        if not known or len(known) < len(self.scores):
+            return None
+        total = sum(known)
+        # The sum of scores near the ends of what a float can be may be infinite, where their mean is not.
+        return total / len(known) if math.isfinite(total) else sum(score / len(known) for score in known)
 
 
 class History:

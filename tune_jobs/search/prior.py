@@ -1,7 +1,8 @@
 """What a search begins with: the points of earlier sweeps, made comparable by their ranks within their own.
 
 Returns of other environments, budgets and stop rules are of other scales. So a point of an earlier sweep is kept as the
-share of that sweep's points that it is better than, and counts like the new sweep's own point of the same rank.
+share of that sweep's points that it is better than, and counts like the new sweep's own point of the same rank. With it
+is kept what a training took: where the new sweep asks for score and cost, the ranks are by both.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, TrialRecord
@@ -17,6 +19,7 @@ from analysis.wording import counted, is_number
 from policies.errors import SpecError, shortened
 from tune_jobs.search.chosen_point import as_written, outside
 from tune_jobs.search.history import TOLD, History, KnownPoint, tell_scores
+from tune_jobs.search.two_objectives import weighed
 from tune_jobs.search.warped import rank_of, shares_of
 from tune_jobs.spec.conditions import Conditions
 from tune_jobs.spec.domains import Range
@@ -48,7 +51,13 @@ def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequenc
     for known, share in zip(ended, shares_of(ended), strict=True):
         point = _seen_by(spec, earlier, known)
         if point is not None:
-            kept.append(PriorPointRecord(point=point, share=None if known.score is None else float(share)))
+            kept.append(
+                PriorPointRecord(
+                    point=point,
+                    share=None if known.score is None else float(share),
+                    env_steps=round(sum(known.env_steps) / len(known.env_steps)) if known.env_steps else None,
+                )
+            )
     if not kept:
         why = f"none of its {counted(len(ended), 'ended point')} lies in this space" if ended else "no point has ended"
         raise SpecError(f"prior: sweep {name} tells nothing, as {why}.", "Widen the space, or leave it out.")
@@ -103,6 +112,34 @@ def _in_form_of(spec: SweepSpec, name: str, value: Any) -> Any:
     domain = spec.space[name]
     is_outside = isinstance(domain, Range) and not is_number(value)
     return value if is_outside else as_written(spec, name, domain, value)
+
+
+def weighed_prior(prior: PriorRecord, index: int, seed: int) -> PriorRecord:
+    """Return an earlier sweep with its points in the order of score and cost as one number, as the own points are.
+
+    They keep the shares that they have together: who is best so has the largest.
+
+    Args:
+        prior: The earlier sweep. One of a former record, which tells no costs, stays as it is.
+        index: The index of the point that is asked for.
+        seed: The new sweep's seed.
+    """
+    scored = [
+        (place, item.share, item.env_steps)
+        for place, item in enumerate(prior.points)
+        if item.share is not None and item.env_steps is not None
+    ]
+    if len(scored) < sum(item.share is not None for item in prior.points):
+        return prior
+    points = list(prior.points)
+    told = weighed([KnownPoint(points[place].point, (share,), (cost,)) for place, share, cost in scored], index, seed)
+    numbers = np.array([each.score for each in told], dtype=np.float64)
+    # Equal ones share what they have.
+    _, ranks, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    shares = np.bincount(np.sort(ranks), np.sort([share for _, share, _ in scored])) / counts
+    for (place, _, _), rank in zip(scored, ranks, strict=True):
+        points[place] = points[place].model_copy(update={"share": float(shares[rank])})
+    return prior.model_copy(update={"points": tuple(points)})
 
 
 def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> list[KnownPoint]:

@@ -34,7 +34,7 @@ from tune_jobs.search.asking import Check, Method, Question
 from tune_jobs.search.history import History, KnownPoint
 from tune_jobs.search.one_thread import one_thread
 from tune_jobs.search.parts import Parts
-from tune_jobs.search.prior import with_prior
+from tune_jobs.search.prior import weighed_prior, with_prior
 from tune_jobs.search.two_objectives import weighed
 from tune_jobs.search.warped import rank_of
 from tune_jobs.spec.conditions import Conditions
@@ -120,6 +120,7 @@ def propose_point(
     known = (history or History(spec)).known_points(records)
     if spec.objective.cost is not None:
         known = weighed(known, drawn_index, spec.seed)
+        prior = [weighed_prior(each, drawn_index, spec.seed) for each in prior]
     return next_point(
         spec.search.type, spec.space, with_prior(known, prior), drawn_index, seed=spec.seed,
         num_startup_trials=spec.search.num_startup_trials, check=check,

@@ -96,7 +96,7 @@ def _with_distances(quantiles: Floats, keys: Floats, shares: Floats) -> Floats:
     upper = np.isinf(keys[:, 0]) & (shares >= 0.5)
     if not upper.any():
         return quantiles
-    values = keys[upper, 1]
+    values = _with_finite_differences(keys[upper, 1])
     above = values - values.min()
     usual = float(above.max())
     if usual > 0:
@@ -106,6 +106,11 @@ def _with_distances(quantiles: Floats, keys: Floats, shares: Floats) -> Floats:
         quantiles = quantiles.copy()
         quantiles[upper] = (quantiles[upper] + distances) / 2
     return quantiles
+
+
+def _with_finite_differences(values: Floats) -> Floats:
+    """Return numbers, or their halves where two of them are too far apart for a float; only ratios are made of them."""
+    return values / 2.0 if math.isinf(float(values.max()) - float(values.min())) else values
 
 
 def _with_seeds(known: Sequence[KnownPoint], scores: Floats) -> Warped:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Self
 
@@ -98,6 +98,13 @@ class AnyDomain(BaseModel, ABC):
         If the hyperparameter accepts all of these, it accepts every value of the domain.
         """
 
+    @abstractmethod
+    def all_values(self, most: int) -> Sequence[Any] | None:
+        """Return every value that the domain can give, once.
+
+        None: they are not listed and more than `most`, or real numbers.
+        """
+
 
 class Listed(AnyDomain):
     """A domain that lists its values."""
@@ -150,6 +157,10 @@ class Listed(AnyDomain):
     @override
     def probes(self) -> list[tuple[int | None, Any]]:
         return list(enumerate(self.values))
+
+    @override
+    def all_values(self, most: int) -> Sequence[Any]:
+        return self.values
 
 
 class Grid(Listed):

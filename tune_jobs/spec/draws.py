@@ -27,8 +27,22 @@ _MOST_DRAWS = 200
 
 def num_points(space: Mapping[str, Domain], num_samples: int, *, most: int = MOST_COMBINATIONS) -> int:
     """Return how many points `draw_points` returns; beyond so many combinations it may return less, but not below."""
-    # Grids that no condition connects multiply, so that only those of one group are listed together.
-    return num_samples * math.prod(len(_acting_indexes(space, group, most)) for group in _connected(_grids(space)))
+    grids = _grids(space)
+    return num_samples * _num_combinations(space, {name: grid.values for name, grid in grids.items()}, most)
+
+
+def num_different(space: Mapping[str, Domain], most: int) -> int | None:
+    """Return how many different points a space has; of more than `most`, some number from `most` on, or None.
+
+    None: a domain has more than `most` values, or a range of real numbers.
+    """
+    values = {}
+    for name, domain in space.items():
+        listed = domain.all_values(most)
+        if listed is None:
+            return None
+        values[name] = listed
+    return _num_combinations(space, values, most)
 
 
 def draw_points(space: Mapping[str, Domain], num_samples: int, sweep_seed: int) -> list[dict[str, Any]]:
@@ -140,37 +154,48 @@ def _grids(space: Mapping[str, Domain]) -> dict[str, Grid]:
     return {name: domain for name, domain in space.items() if isinstance(domain, Grid)}
 
 
-def _connected(grids: Mapping[str, Grid]) -> list[list[str]]:
-    """Divide grids into groups between which there is no condition, each in the order of the space."""
+def _num_combinations(space: Mapping[str, Domain], values: Mapping[str, Sequence[Any]], most: int) -> int:
+    """Return how many combinations there are of values by name; beyond `most` it may return less, but not below."""
+    # What no condition connects multiplies, so that only the values of one group are listed together.
+    groups = _connected({name: space[name] for name in values})
+    return math.prod(len(_acting_indexes(space, values, group, most)) for group in groups)
+
+
+def _connected(domains: Mapping[str, Domain]) -> list[list[str]]:
+    """Divide domains into groups between which there is no condition, each in the order of the space."""
     groups: list[set[str]] = []
-    for name, grid in grids.items():
-        touched = {name, *(other for other in grid.when or {} if other in grids)}
+    for name, domain in domains.items():
+        touched = {name, *(other for other in domain.when or {} if other in domains)}
         groups = [group for group in groups if not group & touched] + [
             touched.union(*(group for group in groups if group & touched))
         ]
-    return [[name for name in grids if name in group] for group in groups]
+    return [[name for name in domains if name in group] for group in groups]
 
 
 def _acting_combinations(space: Mapping[str, Domain], names: list[str]) -> list[dict[str, Any]]:
     """Return each combination of some grids' values once, without values that do not act, in the order of the grid."""
-    grids, found = _grids(space), _acting_indexes(space, names)
+    values = {name: grid.values for name, grid in _grids(space).items()}
+    found = _acting_indexes(space, values, names)
     found.sort(key=lambda indexes: [indexes.get(name, -1) for name in names])
-    return [{name: grids[name].values[indexes[name]] for name in names if name in indexes} for indexes in found]
+    return [{name: values[name][indexes[name]] for name in names if name in indexes} for indexes in found]
 
 
 def _acting_indexes(
-    space: Mapping[str, Domain], names: list[str], most: int = MOST_COMBINATIONS
+    space: Mapping[str, Domain],
+    values: Mapping[str, Sequence[Any]],
+    names: Sequence[str],
+    most: int = MOST_COMBINATIONS,
 ) -> list[dict[str, int]]:
-    """Return the same in any order, as the places of values in their grids; of too many, some of their beginnings."""
-    grids, conditions = _grids(space), Conditions(space)
+    """Return the same in any order, as the places of values in their lists; of too many, some of their beginnings."""
+    conditions = Conditions(space)
     found: list[dict[str, int]] = [{}]
     for name in in_order(space):
         if name in names:
             grown: list[dict[str, int]] = []
             for indexes in found:
-                known = {other: grids[other].values[index] for other, index in indexes.items()}
+                known = {other: values[other][index] for other, index in indexes.items()}
                 acts = name in conditions.acting(known)
-                grown += [indexes | {name: index} for index in range(len(grids[name].values))] if acts else [indexes]
+                grown += [indexes | {name: index} for index in range(len(values[name]))] if acts else [indexes]
                 if len(grown) >= most:
                     return grown
             found = grown

@@ -22,7 +22,7 @@ from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
 from tune_jobs.spec.sections import AboutSpec
 from tune_jobs.spec.sweep_spec import SweepSpec
-from tune_jobs.spec.yaml import parse_yaml
+from tune_jobs.spec.yaml import parse_value, parse_yaml
 from tune_jobs.store.names import SWEEP_RECORD
 
 # The most bytes of a file, for the most characters that are read, at 4 bytes each.
@@ -290,7 +290,7 @@ def _apply_override(data: dict[str, Any], override: str) -> str:
             )
         section = child
     if text.strip():
-        section[last] = parse_yaml(text, f"--set {override if len(override) <= 80 else path}")
+        section[last] = parse_value(text, f"--set {override if len(override) <= 80 else path}")
     elif last in section or _is_known(path):
         section.pop(last, None)
     else:

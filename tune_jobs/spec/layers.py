@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -123,3 +124,11 @@ class Layers(AnyDomain):
         return [
             (None, [size] * number) for _, size in self.sizes.probes() for number in dict.fromkeys(self.layers.number)
         ]
+
+    @override
+    def all_values(self, most: int) -> Sequence[Any] | None:
+        fewest, longest = self.layers.number
+        numbers, sizes = range(fewest, longest + 1), self.sizes.all_values(most)
+        if sizes is None or sum(len(sizes) ** number for number in numbers) > most:
+            return None
+        return [list(layers) for number in numbers for layers in itertools.product(sizes, repeat=number)]

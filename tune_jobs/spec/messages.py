@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Any, get_args, get_origin
@@ -21,7 +20,7 @@ from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.layers import LayersFields
 from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
 from tune_jobs.spec.problems import Problem
-from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
+from tune_jobs.spec.sections import NAME_RULE, SweepFields
 from tune_jobs.spec.slips import text_of_no_space
 
 
@@ -124,14 +123,11 @@ def _of_one_word(detail: Detail) -> str | None:
 def _of_a_number(location: Sequence[int | str], detail: Detail) -> str | None:
     """Return what to write where the name of a sweep is read as a number; None: this is not the mistake."""
     number = detail["input"]
-    if (
-        location[:1] not in (["name"], ["prior"])
-        or not is_number(number)
-        or not re.fullmatch(NAME_PATTERN, str(number))
-    ):
+    if location[:1] not in (["name"], ["prior"]) or not is_number(number) or number < 0:
         return None
-    text = f"'{number}'"
-    return f'{number} is a number: put it in quotes, {text}, and on a command line in two pairs, "{text}"'
+    # How it was written is lost, and 1.10, 2024_01 and 1e5 name other sweeps than the numbers' own texts.
+    quoted = "put the name in quotes as you wrote it, '...', and on a command line in two pairs, \"'...'\""
+    return f"is read as the number {number}: {quoted}"
 
 
 def _without_tags(location: Iterable[int | str]) -> list[int | str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from decimal import Decimal
 from typing import Any, ClassVar, Self
 
@@ -111,6 +112,14 @@ class Range(AnyDomain):
         fraction = None if self.q is not None and self.q.is_integer() else low + (high - low) / math.pi
         inside = [] if fraction is None else [(None, fraction)]
         return [(0, low), (1, high), *inside]
+
+    @override
+    def all_values(self, most: int) -> Sequence[Any] | None:
+        first, last = map(round, self.codes)
+        if not self.is_stepped or last - first >= most:
+            return None
+        # Steps so small that floats hardly tell them apart may come to one value.
+        return list(dict.fromkeys(map(self.of_code, range(first, last + 1))))
 
     def at_factor(self, factor: int) -> Any:
         """Return `factor` times q: an int in a range of whole numbers, else a float."""

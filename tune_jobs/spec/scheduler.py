@@ -83,5 +83,6 @@ class SchedulerSpec(Section):
 
 
 def num_worst(num_trials: int, fraction: float) -> int:
-    """Return how many trials are the worst, and how many are the best."""
-    return min(math.ceil(num_trials * fraction), num_trials // 2)
+    """Return how many trials are the worst, and how many are the best: at least one, unless there is one alone."""
+    # 0.28 of 25 are 7, though their product is a little more in floats.
+    return min(max(1, math.ceil(num_trials * fraction - 1e-9)), num_trials // 2)

@@ -25,6 +25,7 @@ _MERGE = f"{_TAG}merge"
 _TWO_MEANINGS = "two meanings"
 _CORRECT = "Correct the YAML there."
 _SMALLER = "Write it shorter: a sweep file holds settings, not data."
+_MOST_SHOWN = 80
 _DIGITS = "[0-9]+(?:_[0-9]+)*"
 # Words that YAML 1.1 reads as a number or a truth value, and YAML 1.2 as something else.
 _TRUTH = {"yes": "true", "on": "true", "no": "false", "off": "false"}
@@ -74,6 +75,24 @@ def parse_yaml(text: str, label: str) -> Any:
         ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SpecError(f"{label}: this is not YAML: {error}", "Correct the YAML.") from error
+
+
+def parse_value(text: str, label: str) -> Any:
+    """Return the data of a value that stands on a command line; the arguments are those of `parse_yaml`.
+
+    Raises:
+        SpecError: As there; or it is only a comment, which would be null.
+    """
+    value = parse_yaml(text, label)
+    comment = text.strip()
+    if value is None and comment.startswith("#"):
+        shown = comment if len(comment) <= _MOST_SHOWN else f"{comment[: _MOST_SHOWN - 3]}..."
+        quoted = "'" + shown.replace("'", "''") + "'"
+        raise SpecError(
+            f"{label}: {shown} is a comment in YAML, so there is no value",
+            f'If it is the value, put it in quotes, {quoted}, and on a command line in two pairs, "{quoted}".',
+        )
+    return value
 
 
 class _Extent(NamedTuple):

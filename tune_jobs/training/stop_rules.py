@@ -18,10 +18,13 @@ def stop_reason(
         is_full: Whether the training return is the mean of 100 episodes. With fewer, a lucky start would
             count as solved.
     """
-    if is_full and _reaches(record.training_return, stop.training_return):
-        return f"training_return {record.training_return:.4g} >= {stop.training_return:g}"
-    if _reaches(evaluation_return, stop.evaluation_return):
-        return f"evaluation_return {evaluation_return:.4g} >= {stop.evaluation_return:g}"
+    goals = {
+        "training_return": (record.training_return if is_full else None, stop.training_return),
+        "evaluation_return": (evaluation_return, stop.evaluation_return),
+    }
+    for goal, (value, target) in goals.items():
+        if value is not None and target is not None and value >= target:
+            return _told(goal, value, target)
     caps = {
         "num_episodes": (record.num_episodes, stop.num_episodes),
         "num_env_steps": (record.num_env_steps, stop.num_env_steps),
@@ -32,9 +35,16 @@ def stop_reason(
             return f"{name} {count} >= {cap}"
     # A wait for others is no training of its own; a trial that gave its place away does not count it at all.
     if (trained_s := record.time_s - record.waited_s) >= stop.time_s:
-        return f"time_s {trained_s:.0f} >= {stop.time_s:g}"
+        return _told("time_s", trained_s, stop.time_s, decimals=0)
     return None
 
 
-def _reaches(value: float | None, target: float | None) -> bool:
-    return value is not None and target is not None and value >= target
+def _told(name: str, value: float, target: float, *, decimals: int = 4) -> str:
+    """Return in words that a value reached its target; it is rounded unless that would bring it below the target."""
+    rounded = round(float(value), decimals) + 0.0  # -0.0 is 0
+    return f"{name} {_digits(rounded if rounded >= target else value)} >= {_digits(target)}"
+
+
+def _digits(number: float) -> str:
+    """Return a number with all of its digits, so that the comparison that is told is the one that was made."""
+    return repr(float(number)).removesuffix(".0")
