@@ -29,7 +29,7 @@ class ConstantPolicy(Policy):
     """A policy that repeats one action, whatever it observes; where a mask forbids it, the first that is allowed.
 
     Args:
-        observation_space: The env's; only its shape matters.
+        observation_space: The env's; only its shape, its type and its mask matter.
         action_space: The space that holds the action.
         action: An int (Discrete), or one number for each component (Box).
         env_id: The environment it is for.

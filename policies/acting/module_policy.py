@@ -39,6 +39,10 @@ class ModulePolicy(WeightsPolicy):
         assert portable.network.module is not None  # read_policy and save_policy have checked it
         self.module = self._build(portable.network.module)
 
+    def __reduce__(self) -> tuple[type[ModulePolicy], tuple[PortablePolicy, str]]:
+        # Modules hold what can't be pickled, such as RLlib's distributions of several choices: it is built anew.
+        return type(self), (self.portable, self.description)
+
     def _build(self, saved: ModuleWeights) -> RLModule:
         module = RLModuleSpec(
             module_class=import_module_class(saved.class_path),

@@ -22,6 +22,7 @@ from policies.files import atomic_path, write_atomic
 GIF_MAX_BYTES = 3_000_000
 _GIF_MAX_FPS = 25.0  # GIF delays are whole hundredths of a second, and many viewers slow down those below 3 of them
 _GIF_MAX_FRAMES = 500
+_LONGEST_CS = 65_535  # hundredths of a second that a GIF can show a frame: its format has two bytes for them
 _GIF_COLORS = 128
 # Pairs (scale, n): every n-th frame is kept, at this scale; tried in turn until the GIF is small enough.
 _GIF_ATTEMPTS = ((1.0, 1), (1.0, 2), (0.75, 2), (0.75, 4), (0.5, 4), (0.5, 8), (0.25, 8))
@@ -242,7 +243,7 @@ class GifWriter:
     def _encode(self, scale: float, step: int) -> bytes:
         frames = _every(step, self._frames)
         starts = [round(start * 100) for start, _, _ in frames] + [round(self._time_s * 100)]
-        durations = [10 * max(2, end - start) for start, end in itertools.pairwise(starts)]
+        durations = [10 * min(max(2, end - start), _LONGEST_CS) for start, end in itertools.pairwise(starts)]
         pictures = [picture for _, _, picture in frames]
         if scale < 1:
             size = tuple(max(1, round(length * scale)) for length in pictures[0].size)

@@ -264,7 +264,7 @@ class RandomPolicy(Policy):
     """Draws actions uniformly from the action space, or from what a mask allows, as `action_space.sample()` does.
 
     Args:
-        observation_space: The env's; only its shape matters.
+        observation_space: The env's; only its shape, its type and its mask matter.
         action_space: The space that actions are drawn from.
         env_id: The environment it is for.
         env_args: The arguments of that environment.

@@ -29,7 +29,7 @@ from policies.errors import EnvError, SpecError, said_by
 MAX_ENDLESS_STEPS = 3_000
 """Env steps of an episode that are filmed where the env sets no limit to them: 100 s at 30 frames a second."""
 _HOLD_S = 1.0  # the last picture stays, so that the final return can be read
-_MOST_FPS = 999.0  # of an environment with more, a film is as much slower
+_LEAST_FPS, _MOST_FPS = 0.1, 999.0  # of an environment with less or more, a film is as much faster or slower
 _GIF_SCALE = 0.5
 _GIF_MIN_WIDTH = 280
 _BACKGROUND = (24, 27, 34)
@@ -70,8 +70,8 @@ def record_video(
         mp4: File to write (H.264); None: no MP4.
         gif: File to write (looping, half the size, at most about 3 MB); None: no GIF.
         caption: Text in the left half of the caption strip; None: the policy's description.
-        fps: Frames a second; None: the env's `render_fps`, so that it plays in real time, but 999 if that is more, and
-            30 if it has none, or one that is no rate.
+        fps: Frames a second; None: the env's `render_fps`, so that it plays in real time, but 999 if that is more,
+            0.1 if it is less, and 30 if it has none, or one that is no rate.
         max_steps: Cap on the env steps of an episode; None: the env's limit, or `MAX_ENDLESS_STEPS` if it sets none.
 
     Returns:
@@ -177,7 +177,7 @@ class _Stage:
             check_policy(policy, self._env)
             self._cap = episode_cap(self._env, max_steps, unlimited=MAX_ENDLESS_STEPS)
             # A sweep's films are made at its end: they are not lost over a rate that none can have.
-            self.fps = min(frames_per_second(self._env.metadata), _MOST_FPS)
+            self.fps = max(_LEAST_FPS, min(frames_per_second(self._env.metadata), _MOST_FPS))
         except BaseException:
             close_env(self._env)
             raise

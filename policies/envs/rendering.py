@@ -48,7 +48,7 @@ def frames_per_second(metadata: Mapping[str, Any]) -> float:
     """Return the frames a second of an environment's own time, by its metadata."""
     try:
         rate = float(metadata.get("render_fps") or _DEFAULT_FPS)
-    except (TypeError, ValueError):  # whatever it is, it is no number
+    except (TypeError, ValueError, OverflowError):  # whatever it is, it is no number
         return _DEFAULT_FPS
     return rate if 0 < rate < math.inf else _DEFAULT_FPS
 

@@ -185,6 +185,7 @@ DQN_RULES: dict[str, Rules] = {
             _target_follows_updates,
             ("target_update_freq", "tau", "target_update_unit", "train_freq", "num_envs", "updates_per_env_step"),
             of_value=True,
+            divides=True,
         ),
     ),
     "target_update_unit": (

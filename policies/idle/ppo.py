@@ -19,6 +19,7 @@ _ONE_UPDATE = Rule(
     "that sampled",
     _makes_one_update,
     ("num_epochs", "minibatch_size", "train_batch_size", "num_envs"),
+    divides=True,
 )
 _NO_KL_LOSS = Rule("use_kl_loss is false", lambda h, _: not h.use_kl_loss, ("use_kl_loss",))
 _NO_KL_COEFF = Rule(

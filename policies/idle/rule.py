@@ -33,6 +33,8 @@ class Rule:
     """The hyperparameters that `holds` looks at."""
     of_value: bool = False
     """Whether `holds` looks at the idle hyperparameter itself: then all values for which it holds act alike."""
+    divides: bool = False
+    """Whether `holds` divides hyperparameters by others: then it may hold at both ends of a range and not between."""
     words: Callable[[Any, Limits], str] | None = None
     """Makes the reason for hyperparameters for which the rule holds, with their values; None: `why` is the reason."""
 

@@ -293,6 +293,22 @@ def test_a_copy_is_the_same_sweep_until_one_of_both_goes_on(tmp_path: Path, plac
     assert "in common" not in said(apart)
 
 
+def test_copies_that_both_went_on_have_only_what_they_had_before_in_common(tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "one")
+    copied = SweepStore(shutil.copytree(store.folder, tmp_path / "copy"))
+    for each in (store, copied):
+        extend_by_leaders(each)
+    with pytest.raises(SpecError, match="are the same sweep"):
+        tune_jobs.compare([store.folder, copied.folder])
+    for trial_id in ("t0004", "t0005"):
+        trial = copied.trial(trial_id).read_record()
+        others = {"hyperparams": {**trial.hyperparams, "lr": 0.5}, "evaluation_return": 1.0}
+        copied.trial(trial_id).write_record(trial.model_copy(update=others))
+    assert "A and B have 4 trainings in common" in said(tune_jobs.compare([store.folder, copied.folder]))
+    new = tune_jobs.compare([each.folder / "trials" / "t0004" for each in (store, copied)])
+    assert "in common" not in said(new)
+
+
 def test_a_sweep_that_goes_on_between_two_looks_at_it_is_the_same_sweep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -332,6 +332,8 @@ def without_place(store: SweepStore) -> None:
         ("s3://b/s/mine?endpoint=http://h:9000", "s3://b/s/mine", True),
         ("s3://b/s/mine?endpoint=http://h:9000&region=r", "s3://b/s/mine?region=r&endpoint=http://h:9000", True),
         ("s3://b/s/mine?endpoint=http://h:9000", "s3://b/s/mine?endpoint=http://h:9001", False),
+        ("s3://b/s/mine?endpoint=http://h:9000&region=q", "s3://b/s/mine?endpoint=http://h:9000&region=r", True),
+        ("s3://b/s/mine?endpoint=http://h:9000", "s3://b/s/mine?endpoint=http://h:9000/", True),
         ("s3://b/s/mine", "s3://b/s/copy", False),
         ("s3://b/s/mine", "gs://b/s/mine", False),
         ("s3://b/s/mine", "/s/mine", False),

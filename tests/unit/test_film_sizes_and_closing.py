@@ -248,7 +248,31 @@ def test_an_environment_is_filmed_whatever_rate_it_tells(
     reader.close()
 
 
-@pytest.mark.parametrize("told", [None, 0, -5, np.nan, np.inf, "fast", [30, 30], np.array([1, 2])])
+@pytest.mark.parametrize("told", [1 / 900, 1e-6, 5e-324])
+def test_an_environment_of_slow_time_is_filmed_faster(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, told: float
+) -> None:
+    """A step may be of a quarter of an hour."""
+    monkeypatch.setitem(Grows.metadata, "render_fps", told)
+    mp4, gif = tmp_path / "a.mp4", tmp_path / "a.gif"
+    assert record_video(policy(), env_id=ENV, seeds=0, mp4=mp4, gif=gif, max_steps=2).lengths == (2,)
+    with Image.open(gif) as film:
+        assert film.info["duration"] == 10_000
+    reader = imageio_ffmpeg.read_frames(str(mp4))
+    assert next(reader)["fps"] == 0.1
+    reader.close()
+
+
+def test_a_frame_of_a_gif_is_shown_no_longer_than_one_can_be(tmp_path: Path) -> None:
+    writer = GifWriter(tmp_path / "a.gif", 1 / 900)
+    for shade in (0, 90, 180):
+        writer.add(lambda shade=shade: Image.new("RGB", (40, 30), (shade, 0, 0)))  # type: ignore[misc]
+    writer.save()
+    with Image.open(tmp_path / "a.gif") as film:
+        assert (film.n_frames, film.info["duration"]) == (3, 655_350)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("told", [10**400, None, 0, -5, np.nan, np.inf, "fast", [30, 30], np.array([1, 2])])
 def test_a_rate_that_is_none_is_as_if_it_were_not_told(monkeypatch: pytest.MonkeyPatch, told: Any) -> None:
     monkeypatch.setitem(Grows.metadata, "render_fps", told)
     info, steps = watch_episode(policy(), ENV, {}, 0)

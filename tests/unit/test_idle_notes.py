@@ -130,6 +130,14 @@ def test_what_acts_only_with_a_step_between_the_ends_of_a_range_is_not_refused(c
     assert f"space.{next(iter(space))} can't act: " not in told
 
 
+def test_rules_that_divide_nothing_are_judged_by_the_ends_of_ranges_of_any_length() -> None:
+    wide = {"train_freq": {"randint": [1, 513]}, "num_envs": {"randint": [1, 65]}}
+    with pytest.raises(SpecError, match=r"space\.lr is searched, but can't act"):
+        notes(**DQN, hyperparams={"learning_starts": 200_000}, space={**grid(lr=[1e-3, 1e-4]), **wide}, num_samples=4)
+    told = notes(**DQN, hyperparams={"epsilon_start": 200_000, "epsilon_decay": 77}, space=wide, num_samples=4)
+    assert any(note.startswith("hyperparams.epsilon_decay can't act") for note in told)
+
+
 @pytest.mark.parametrize("most", [7, 8])
 def test_with_too_many_steps_to_look_at_nothing_is_refused(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four numbers of envs with two values, that divide 1,024 all."""

@@ -13,6 +13,7 @@ from fake_sweeps import RunCommand
 from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
 from stores import ObjectHarness
 
+from policies import files
 from policies.errors import CannotRunError
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.objects import object_trial, parts, scratch
@@ -114,6 +115,7 @@ NO_FOLDER = (Path, "mkdir", no_space_for_new_ones)
 FILLS: dict[str, tuple[tuple[object, str, Callable[..., object]], Prepare]] = {
     "a record": ((Path, "write_bytes", no_space), lambda sweep, _: sweep.read_record),
     "more results": ((Path, "open", no_space_to_append), more_results),
+    "fetched results": ((files, "sync", no_space), lambda sweep, _: sweep.trial("t0000").read_results),
     "which object it is": ((Path, "write_text", no_space), fetched_anew),
     "a report": ((shutil, "copyfile", no_space), in_report),
     "a line of a log": (

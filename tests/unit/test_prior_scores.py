@@ -155,7 +155,7 @@ def test_by_score_and_cost_an_earlier_sweeps_points_are_ordered_as_the_own_ones_
     spec = make_spec(**COSTLY)
     failed = record(5, {LENGTH: LENGTHS[0]}, status="failed")
     prior = prior_record(spec, "first", spec, [*longer_is_better(0, 1, 2, 3, 4), failed])
-    assert [item.env_steps for item in prior.points[:-1]] == [length + 100 for length in LENGTHS]
+    assert [item.env_steps for item in prior.points[:-1]] == LENGTHS
     assert order_of(prior) == [0, 1, 2, 3, 4]
     own = [KnownPoint({LENGTH: length}, (length / 7,), (length,)) for length in LENGTHS]
     for index in range(30):
@@ -166,6 +166,20 @@ def test_by_score_and_cost_an_earlier_sweeps_points_are_ordered_as_the_own_ones_
         assert made.points[-1] == prior.points[-1]
     assert order_of(weighed_prior(prior, index_with(0.0, OF_THE_COST), seed=0)) == [4, 3, 2, 1, 0]
     assert order_of(weighed_prior(prior, index_with(OF_THE_SCORE, 1.0), seed=0)) == [0, 1, 2, 3, 4]
+
+
+def test_what_a_last_iteration_has_beyond_the_end_orders_nothing() -> None:
+    """Of one length all cost the same, also those that a scheduler stopped, which count with the length they had."""
+    space = {"lr": {"loguniform": [1e-5, 1e-1]}}
+    fields: dict[str, Any] = {"space": space, "stop": {"num_env_steps": 50_000}}
+    earlier = make_spec(**fields, scheduler={"type": "asha", "grace_env_steps": 5_000})
+    new = make_spec(**fields, objective=["return", "env_steps"], search="gp", prior="first")
+    rates = [1e-5 * 2.0**place for place in range(12)]
+    stopped = [record(place, {"lr": rates[place]}, 10.0 + place, status="stopped", steps=5_120) for place in range(8)]
+    ended = [record(place, {"lr": rates[place]}, 100.0 * place, steps=50_176) for place in range(8, 12)]
+    prior = prior_record(new, "first", earlier, [*stopped, *ended])
+    for index in range(30):
+        assert ranked(weighed_prior(prior, index, seed=0)) == rates
 
 
 def test_points_that_are_alike_in_score_and_cost_share_their_place() -> None:

@@ -12,10 +12,12 @@ from services import FAKE, client, postgresql, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 from test_service_submitting import away
 
+from policies.errors import CannotRunError, CheckpointError, TuneJobsError
 from tune_jobs.service.database.opening import sqlite_url
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.service import Service
 from tune_jobs.service.views import ListView, SweepView
+from tune_jobs.store.sweep_store import SweepStore
 
 # ruff: noqa: F811 - fixtures are named as arguments
 
@@ -125,6 +127,127 @@ def test_a_damaged_sweep_is_deleted_by_whose_it_was(service: Service) -> None:
     assert as_("ann", service).delete(MINE, params={"force": True}).status_code == 204
 
 
+def unreadable_once(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the next look at a sweep, and no further one, find it damaged, as where no file can be opened just then."""
+    see, looks = service.statuses.see, iter([CheckpointError("Too many open files.")])
+
+    def once(name: str) -> Any:
+        for error in looks:
+            raise error
+        return see(name)
+
+    monkeypatch.setattr(service.statuses, "see", once)
+
+
+def test_a_moment_in_which_it_cannot_be_read_makes_a_new_sweep_not_the_former_ones(
+    client: TestClient, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ann = as_("ann", service)
+    submitted(service)
+    make_anew(service)
+    changes: tuple[tuple[str, str, Any, int], ...] = (
+        ("PATCH", MINE, {"note": "mine"}, 500),
+        ("POST", f"{MINE}/extend", {"num_samples": 1}, 500),
+        # That one need not be readable.
+        ("DELETE", f"{MINE}?force=true", None, 403),
+    )
+    for method, path, content, status in changes:
+        with monkeypatch.context() as patch:
+            unreadable_once(service, patch)
+            answer = ann.request(method, path, json=content)
+        assert answer.status_code == status, answer.text
+    assert folder_of(service).exists()
+    assert said(client.get(MINE).json()) == NOTHING
+
+
+def test_who_may_not_change_a_damaged_sweep_is_told_so(service: Service) -> None:
+    submitted(service)
+    (folder_of(service) / "sweep.json").write_text("{")
+    assert as_("bob", service).patch(MINE, json={"note": "mine"}).status_code == 403
+    assert as_("ann", service).patch(MINE, json={"note": "mine"}).status_code == 500
+    shutil.rmtree(folder_of(service))
+    assert as_("bob", service).delete(MINE).status_code == 403
+    assert as_("ann", service).delete(MINE).status_code == 404
+
+
+@pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)
+@pytest.mark.parametrize("is_damaged", [False, True])
+@pytest.mark.parametrize("is_labelled", [False, True])
+def test_whoever_takes_the_name_of_a_sweep_while_it_is_deleted_has_the_new_one(
+    client: TestClient, service: Service, monkeypatch: pytest.MonkeyPatch, *, is_damaged: bool, is_labelled: bool
+) -> None:
+    submitted(service)
+    if not is_labelled:
+        service.labels.forget("mine")
+    if is_damaged:
+        (folder_of(service) / "sweep.json").write_text("{")
+    remove_sweep, bob = service.queue.remove_sweep, as_("bob", service)
+
+    def removing(name: str) -> None:
+        remove_sweep(name)
+        assert bob.post("/api/v1/sweeps", json=NEW).status_code == 201
+
+    monkeypatch.setattr(service.queue, "remove_sweep", removing)
+    assert client.delete(MINE, params={"force": True}).status_code == 204
+    assert said(client.get(MINE).json())[:3] == ("bob", "for the paper", ["paper"])
+
+
+@pytest.mark.parametrize("created_at", [None, 0.0])
+def test_of_a_sweep_that_is_deleted_nothing_stays(
+    client: TestClient, service: Service, created_at: float | None
+) -> None:
+    for is_damaged in (False, True):
+        make_sweep_folder(folder_of(service))
+        service.labels.change("mine", owner="ann", created_at=created_at)
+        if is_damaged:
+            (folder_of(service) / "sweep.json").write_text("{")
+        assert client.delete(MINE, params={"force": True}).status_code == 204
+        assert service.labels.all() == {}
+
+
+def test_of_a_sweep_of_a_name_that_is_deleted_no_former_one_is_left(client: TestClient, service: Service) -> None:
+    submitted(service)
+    make_anew(service)
+    assert client.delete(MINE, params={"force": True}).status_code == 204
+    assert service.labels.all() == {}
+
+
+def unreadable(patch: pytest.MonkeyPatch, error: TuneJobsError) -> None:
+    def read(_: SweepStore) -> None:
+        raise error
+
+    patch.setattr(SweepStore, "read_record", read)
+
+
+@pytest.mark.parametrize("error", [CheckpointError("Too many open files."), CannotRunError("The store is away.")])
+def test_a_sweep_that_cannot_be_read_when_it_was_written_is_whose_it_is(
+    client: TestClient, service: Service, error: TuneJobsError
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        unreadable(patch, error)
+        assert as_("ann", service).post("/api/v1/sweeps", json=NEW, headers=KEY).status_code == 201
+    assert said(client.get(MINE).json())[:3] == ("ann", "for the paper", ["paper"])
+    assert service.labels.of("mine").created_at == service.storage.sweep("mine").read_record().created_at
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(CheckpointError("Too many open files."), 500), (CannotRunError("The store is away."), 503)]
+)
+def test_a_request_that_is_repeated_is_no_success_while_nothing_says_whose_the_sweep_is(
+    client: TestClient, service: Service, error: TuneJobsError, status: int
+) -> None:
+    ann = as_("ann", service)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service.labels, "change", away)
+        assert ann.post("/api/v1/sweeps", json=NEW, headers=KEY).status_code == 503
+    with pytest.MonkeyPatch.context() as patch:
+        unreadable(patch, error)
+        assert ann.post("/api/v1/sweeps", json=NEW, headers=KEY).status_code == status
+    assert client.get(MINE).json()["owner"] is None
+    assert ann.post("/api/v1/sweeps", json=NEW, headers=KEY).status_code == 200
+    assert client.get(MINE).json()["owner"] == "ann"
+
+
 def test_a_label_that_does_not_say_of_which_sweep_counts(client: TestClient, service: Service) -> None:
     """So do those of earlier versions."""
     make_sweep_folder(folder_of(service))
@@ -166,7 +289,7 @@ def test_a_request_that_is_repeated_while_its_sweep_is_written_says_not_whose_an
     """The name may be taken yet, and the sweep gets another one then."""
     new = {key: value for key, value in NEW.items() if key != "name"} | {"default_name": "mine"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.submitter, "_written", lambda job, *_: job)
+        patch.setattr(service.submitter, "_written", lambda job, *_: (job, 1.0))
         patch.setattr(service.queue, "created", lambda job_id, **_: service.queue.job(job_id))
         assert as_("ann", service).post("/api/v1/sweeps", json=new, headers=KEY).status_code == 201
     make_sweep_folder(folder_of(service))

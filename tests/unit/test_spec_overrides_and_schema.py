@@ -166,6 +166,15 @@ def test_a_value_that_is_only_a_comment_is_refused_with_the_quotes_that_it_needs
     assert load_spec(MINIMAL, [f"env.args.color={quoted}"]).env.args == {"color": written}
 
 
+def test_a_value_that_ends_with_a_comment_is_not_cut() -> None:
+    with pytest.raises(SpecError, match="what follows red is a comment in YAML, and no part of the value") as caught:
+        load_spec(MINIMAL, ["env.args.color=red #2"])
+    assert "put it in quotes, 'red #2'" in caught.value.hint
+    kept = {"'red #2'": "red #2", "red#2": "red#2", '"red #2"': "red #2", "{a: 1} \n # 2": {"a": 1}}
+    for text, value in kept.items():
+        assert load_spec(MINIMAL, [f"env.args.color={text}"]).env.args["color"] == value
+
+
 def test_null_and_nothing_are_no_comments() -> None:
     base = {**MINIMAL, "env": {"id": "CartPole-v1", "args": {"color": "red"}}}
     assert load_spec(base, ["env.args.color=null"]).env.args == {"color": None}

@@ -34,7 +34,7 @@ _MOST_COMBINATIONS = 20_000
 _MOST_NAMED = 8
 """The most points that a note lists by number; more are counted."""
 _DIVIDED_BY_NUM_ENVS = {"ppo": "train_batch_size", "dqn": "train_freq"}
-"""What rules divide by num_envs: whether such a rule holds may change with every step of either."""
+"""What rules that divide have to do with num_envs: whether one holds may change with every step of either."""
 _LEAST_SHARE = 0.1
 """The share of the points from which on a note says that values of a range act alike."""
 
@@ -174,7 +174,7 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
     others = {read: _values_of(domain) + _named(related, read) for read, domain in related.items() if read != name}
     others = {read: list({json.dumps(value): value for value in values}.values()) for read, values in others.items()}
     why = _rules_that_hold(points, name, own, rules, others=others)
-    if any("num_envs" in rule.reads for rule in why):
+    if any(rule.divides for rule in why):
         divided = [read for read in ("num_envs", _DIVIDED_BY_NUM_ENVS[spec.algorithm]) if read in others]
         steps = {read: _every_step(domain) for read in divided if isinstance(domain := related[read], Range)}
         why = _rules_that_hold(points, name, own, rules, others={**others, **steps})

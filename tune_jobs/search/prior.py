@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, TrialRecord
+from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, TrialRecord, length_of
 from analysis.wording import counted, is_number
 from policies.errors import SpecError, shortened
 from tune_jobs.search.chosen_point import as_written, outside
@@ -55,7 +55,7 @@ def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequenc
                 PriorPointRecord(
                     point=point,
                     share=None if known.score is None else float(share),
-                    env_steps=round(sum(known.env_steps) / len(known.env_steps)) if known.env_steps else None,
+                    env_steps=_mean_cost(known, earlier),
                 )
             )
     if not kept:
@@ -84,6 +84,17 @@ def _check_the_same(spec: SweepSpec, sweep: str, earlier: SweepSpec) -> None:
             f"prior: sweep {sweep} is none that this search could begin with: {'; '.join(different)}.",
             "Leave it out, or search what it searched.",
         )
+
+
+def _mean_cost(known: KnownPoint, earlier: SweepSpec) -> int | None:
+    """Return the mean env steps that a training of a point takes, without what its last iteration has beyond its end.
+
+    Trainings of one length cost the same: what they have beyond it would decide where nothing else differs.
+    """
+    if not known.env_steps:
+        return None
+    length = length_of(known.point, earlier.stop.num_env_steps)
+    return round(sum(min(steps, length) for steps in known.env_steps) / len(known.env_steps))
 
 
 def _fixed_in(earlier: SweepSpec) -> dict[str, Any]:

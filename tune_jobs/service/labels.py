@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Engine, RowMapping, delete, func, insert, select, update
+from sqlalchemy import Engine, RowMapping, delete, func, insert, or_, select, update
 from sqlalchemy.exc import IntegrityError
 
+from policies.errors import TuneJobsError
 from tune_jobs.service.database.tables import sweeps
+from tune_jobs.service.jobs import Job
+from tune_jobs.service.queue import Queue
+from tune_jobs.service.storage_health import is_of_store
+from tune_jobs.store.contract import Storage
+from tune_jobs.store.patience import impatient
 
 _SAME_S = 1e-3
 """Two sweeps of one name are created further apart; a database may round."""
@@ -23,7 +29,7 @@ class Label:
     note: str = ""
     tags: tuple[str, ...] = ()
     created_at: float | None = None
-    """When that sweep was created; None: an earlier version wrote it, which did not say."""
+    """When that sweep was created; None: an earlier version wrote it, which did not say, and `date` has not yet."""
 
     def of(self, created_at: float) -> Label:
         """Return what counts of it for the sweep that has the name now: nothing if it was said of another one."""
@@ -96,10 +102,63 @@ class Labels:
                     connection.execute(change)
         return self.of(name)
 
-    def forget(self, name: str) -> None:
-        """Forget a sweep that is deleted."""
+    def forget(self, name: str, created_at: float | None = None) -> None:
+        """Forget a sweep that is deleted.
+
+        Args:
+            name: The sweep.
+            created_at: When it was created: what is said of a later one of the name stays. None: nothing does.
+        """
+        forgotten = delete(sweeps).where(sweeps.c.name == name)
+        if created_at is not None:
+            is_later = sweeps.c.created_at > created_at + _SAME_S
+            forgotten = forgotten.where(or_(sweeps.c.created_at.is_(None), ~is_later))
         with self._engine.begin() as connection:
-            connection.execute(delete(sweeps).where(sweeps.c.name == name))
+            connection.execute(forgotten)
+
+    def date(self, found: Mapping[str, float | None]) -> None:
+        """Say of labels that do not say so of which sweep they are.
+
+        Args:
+            found: When each one's sweep was created; None: it is no more, and its label is forgotten.
+        """
+        with self._engine.begin() as connection:
+            for name, created_at in found.items():
+                change = delete(sweeps) if created_at is None else update(sweeps).values(created_at=created_at)
+                connection.execute(change.where(sweeps.c.name == name, sweeps.c.created_at.is_(None)))
+
+
+def date_labels(labels: Labels, queue: Queue, storage: Storage) -> None:
+    """Say of labels that an earlier version wrote of which sweep they are, as the sweeps' jobs tell it.
+
+    What can't be read now is left for the next start. Where all are dated, as after the first start, this reads no
+    sweep.
+    """
+    undated = [name for name, label in labels.all().items() if label.created_at is None]
+    if not undated:
+        return
+    jobs: dict[str, list[Job]] = {}
+    for job in queue.jobs():
+        jobs.setdefault(job.sweep, []).append(job)
+    found: dict[str, float | None] = {}
+    with impatient():
+        for name in undated:
+            try:
+                created_at = storage.sweep(name).read_record().created_at
+            except TuneJobsError as error:
+                if is_of_store(storage, error):
+                    break
+                continue
+            found[name] = None if _was_removed(jobs.get(name, []), created_at) else created_at
+    labels.date(found)
+
+
+def _was_removed(jobs: Sequence[Job], created_at: float) -> bool:
+    """Whether a sweep of the name had jobs before, and the one that has it now was not submitted."""
+    present = [job for job in jobs if not job.is_of_former(created_at)]
+    # One that is submitted has its job first; a later job may be of whoever resumes it, or of a start that finds it.
+    was_submitted = any(job.submitted_at <= created_at for job in present)
+    return len(present) < len(jobs) and not was_submitted
 
 
 def _label(row: RowMapping) -> Label:

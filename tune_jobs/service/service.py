@@ -24,7 +24,7 @@ from tune_jobs.service.database.opening import open_database
 from tune_jobs.service.derived import Derived
 from tune_jobs.service.events import Watch
 from tune_jobs.service.jobs import Job
-from tune_jobs.service.labels import Labels
+from tune_jobs.service.labels import Labels, date_labels
 from tune_jobs.service.metrics import Metrics
 from tune_jobs.service.queue import Queue
 from tune_jobs.service.state_metrics import EnvSteps, StateCollector
@@ -127,6 +127,7 @@ def opened(config: ServiceConfig) -> Iterator[Service]:
                 part.start()
                 stack.callback(part.close)
             stack.callback(watching.close)
+            date_labels(labels, queue, storage)
             yield Service(
                 config=config,
                 engine=engine,

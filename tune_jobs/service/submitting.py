@@ -101,6 +101,7 @@ class Submitter:
         owner: str,
         key: str | None = None,
         check_room: Callable[[], None] = lambda: None,
+        on_made: Callable[[Job, float], None] = lambda *_: None,
     ) -> tuple[Job, bool]:
         """Write a sweep and let it wait; return its job, and whether it is new.
 
@@ -110,6 +111,7 @@ class Submitter:
             key: The idempotency key; None: the request has none.
             check_room: Raises an error if the owner may have no further one; of a request that was repeated it is not
                 asked, as that makes none.
+            on_made: Called with the job of a sweep that is new, and with when that was created.
 
         Raises:
             SpecError: The sweep is wrong or not allowed here, its name is taken, or the key was used for another one.
@@ -142,13 +144,19 @@ class Submitter:
             )
         if not is_new:
             return job, False
-        job = self._written(job, submission, spec, plan)
+        job, created_at = self._written(job, submission, spec, plan)
         num_cpus = num_cpus_of(plan)
         with self._noting(job.id, num_cpus):
-            return self._queue.created(job.id, num_cpus=num_cpus), True
+            job = self._queue.created(job.id, num_cpus=num_cpus)
+        on_made(job, created_at)
+        return job, True
 
-    def _written(self, job: Job, submission: Submission, spec: SweepSpec, plan: SweepPlan) -> Job:
-        """Write the sweep of a job, and return the job, which may have another name by then; it is forgotten if not."""
+    def _written(self, job: Job, submission: Submission, spec: SweepSpec, plan: SweepPlan) -> tuple[Job, float]:
+        """Write the sweep of a job; the job is forgotten if that fails.
+
+        Returns:
+            The job, which may have another name by then, and when the sweep was created.
+        """
         try:
             while True:
                 sweep = self._storage.sweep(job.sweep)
@@ -161,7 +169,7 @@ class Submitter:
                     job = self._queue.rename(job.id, self._free_name(submission, spec))
             try:
                 with sweep.lock():
-                    write_new(sweep, spec, plan, self._config.address, "created")
+                    created_at = write_new(sweep, spec, plan, self._config.address, "created")
             except BaseException:
                 sweep.discard()
                 raise
@@ -169,7 +177,7 @@ class Submitter:
             with self._noting(job.id, None):
                 self._queue.forget(job.id)
             raise
-        return job
+        return job, created_at
 
     def settle(self) -> None:
         """Tell the queue what it could not be told before: which sweeps are written by now, and which never will be.

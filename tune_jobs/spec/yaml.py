@@ -81,18 +81,31 @@ def parse_value(text: str, label: str) -> Any:
     """Return the data of a value that stands on a command line; the arguments are those of `parse_yaml`.
 
     Raises:
-        SpecError: As there; or it is only a comment, which would be null.
+        SpecError: As there; or it is only a comment, which would be null, or ends with one.
     """
     value = parse_yaml(text, label)
     comment = text.strip()
+    quotes = f'put it in quotes, {_quoted(comment)}, and on a command line in two pairs, "{_quoted(comment)}"'
     if value is None and comment.startswith("#"):
-        shown = comment if len(comment) <= _MOST_SHOWN else f"{comment[: _MOST_SHOWN - 3]}..."
-        quoted = "'" + shown.replace("'", "''") + "'"
         raise SpecError(
-            f"{label}: {shown} is a comment in YAML, so there is no value",
-            f'If it is the value, put it in quotes, {quoted}, and on a command line in two pairs, "{quoted}".',
+            f"{label}: {_shown(comment)} is a comment in YAML, so there is no value",
+            f"If it is the value, {quotes}.",
+        )
+    kept = comment.partition(" #")[0]
+    if kept != comment and not set(comment) & set("'\"\n"):
+        raise SpecError(
+            f"{label}: what follows {_shown(kept)} is a comment in YAML, and no part of the value",
+            f"If it is one, {quotes}; else leave it out.",
         )
     return value
+
+
+def _shown(text: str) -> str:
+    return text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
+
+
+def _quoted(text: str) -> str:
+    return "'" + _shown(text).replace("'", "''") + "'"
 
 
 class _Extent(NamedTuple):

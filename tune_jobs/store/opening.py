@@ -68,9 +68,11 @@ def is_same_place(one: str, other: str) -> bool:
 
 
 def _is_same_url(one: ObjectUrl, other: ObjectUrl) -> bool:
-    # What only one of them says, the other takes from its environment.
-    both = one.settings.keys() & other.settings.keys()
-    return one.short == other.short and all(one.settings[name] == other.settings[name] for name in both)
+    # What only one of them says, the other takes from its environment; a region does not tell which bucket it is.
+    both = (one.settings.keys() & other.settings.keys()) - {"region"}
+    return one.short == other.short and all(
+        one.settings[name].rstrip("/") == other.settings[name].rstrip("/") for name in both
+    )
 
 
 def others_write(place: str | Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import string
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -173,16 +174,25 @@ def _is_copied(one: Wanted, other: Wanted) -> bool:
 
 
 class _Training(NamedTuple):
-    """What changes of a trial when its sweep goes on."""
+    """What was trained, and what of that changes when its sweep goes on."""
 
     trial_id: str
     status: str
     num_env_steps: int
+    setting: str
+    returns: tuple[float | None, ...]
 
 
 def _trainings(item: Wanted) -> set[_Training]:
     return {
-        _Training(trial.trial_id, trial.status, trial.num_env_steps)
+        _Training(
+            trial.trial_id,
+            trial.status,
+            trial.num_env_steps,
+            # Two copies may each go on with a trial of the same id.
+            json.dumps([trial.engine, trial.seed, trial.hyperparams], sort_keys=True, default=str),
+            (trial.evaluation_return, trial.best_evaluation_return),
+        )
         for trial in item.data.trials
         if item.point_index in (None, trial.point_index)
     }

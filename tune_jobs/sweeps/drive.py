@@ -45,8 +45,8 @@ _most_cpus: ContextVar[float | None] = ContextVar("most_cpus", default=None)
 
 def write_new(
     store: Sweep, spec: SweepSpec, plan: SweepPlan, address: str | None, state: SweepState = "running"
-) -> None:
-    """Write the records of a new sweep, which is run at once or only created."""
+) -> float:
+    """Write the records of a new sweep, which is run at once or only created; return when it was created."""
     for trial in plan.trials:
         store.trial(trial.trial_id).write_record(pending_record(trial), soon=True)
     # Written last: a folder without this record is not a sweep, so no reader sees half of one.
@@ -58,7 +58,7 @@ def write_new(
             evaluation_seeds=plan.evaluation_seeds,
             confirmation_seeds=plan.confirmation_seeds,
             num_trials=len(plan.trials),
-            created_at=time.time(),
+            created_at=(created_at := time.time()),
             versions=versions(),
             git_commit=git_commit(),
             address=address,
@@ -70,6 +70,7 @@ def write_new(
             is_masked=plan.env.mask is not None,
         )
     )
+    return created_at
 
 
 def git_commit() -> str | None:

@@ -75,7 +75,8 @@ sweeps = Table(
 )
 """What people say of sweeps; a sweep without a row is nobody's.
 
-`created_at` says of which sweep of the name: when that one was created; null: an older version wrote the row."""
+`created_at` says of which sweep of the name: when that one was created; null: an older version wrote the row, and
+no start could read the sweep yet."""
 
 tokens = Table(
     "tokens",

@@ -8,11 +8,12 @@ from typing import Annotated, cast
 
 from fastapi import Depends, HTTPException, Request
 
-from policies.errors import NotFoundError
+from policies.errors import CheckpointError
 from tune_jobs.service.access.callers import RANK, Caller
 from tune_jobs.service.access.credentials import CHALLENGE
 from tune_jobs.service.access.refusal import RefusedError
 from tune_jobs.service.service import Service
+from tune_jobs.service.statuses import Seen
 from tune_jobs.service.turns import Turn
 
 _AGAIN_S = 10
@@ -42,17 +43,45 @@ def submitter_of(request: Request) -> Caller:
 
 def changer_of(request: Request, name: str) -> Caller:
     """Return who asks, who may change the sweep in the path."""
+    caller, service = submitter_of(request), service_of(request)
+    # Whose the name is not is told so, whatever is the matter with the sweep.
+    check_changer(service, caller, name)
+    if caller.role != "admin":
+        check_changer(service, caller, name, service.statuses.see(name))
+    return caller
+
+
+def deleter_of(request: Request, name: str) -> Caller:
+    """Return who asks, who may delete the sweep in the path, unless it turns out to be another one's.
+
+    A damaged sweep doesn't say when it was created, and is still to be deleted by whose its name is. Where it can be
+    read after all, the route has to check again.
+    """
     caller = submitter_of(request)
-    service = service_of(request)
+    check_changer(service_of(request), caller, name)
+    with contextlib.suppress(CheckpointError):
+        return changer_of(request, name)
+    return caller
+
+
+def check_changer(service: Service, caller: Caller, name: str, seen: Seen | None = None) -> None:
+    """Check that somebody may change a sweep.
+
+    Args:
+        service: The service.
+        caller: Who asks.
+        name: The sweep.
+        seen: The sweep as it is; None: whose the name is counts, which may be that of another sweep by now.
+
+    Raises:
+        HTTPException: They may not.
+    """
     # What can be no name at all is nothing to ask a database for.
     label = service.labels.of(service.storage.sweep(name).name)
-    if caller.role != "admin" and label.created_at is not None:
-        # A damaged sweep doesn't say when it was created, and is still to be deleted by whose it is.
-        with contextlib.suppress(NotFoundError):
-            label = label.of(service.statuses.see(name).status.sweep.created_at)
+    if seen is not None:
+        label = label.of(seen.status.sweep.created_at)
     if not caller.may_change(label):
         raise HTTPException(403, f"Sweep {name} belongs to {label.owner or 'nobody'}; only they and admins change it.")
-    return caller
 
 
 def admin_of(request: Request) -> Caller:
@@ -100,4 +129,5 @@ TheCaller = Annotated[Caller, Depends(caller_of)]
 ASubmitter = Annotated[Caller, Depends(submitter_of)]
 AnAdmin = Annotated[Caller, Depends(admin_of)]
 AChanger = Annotated[Caller, Depends(changer_of)]
+ADeleter = Annotated[Caller, Depends(deleter_of)]
 ATurn = Annotated[Turn, Depends(planning_turn)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
@@ -11,7 +10,15 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from analysis.records import TrialRecord
 from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.service.access.callers import Caller
-from tune_jobs.service.http.caller import AChanger, ASubmitter, ATurn, TheService, set_audit_target
+from tune_jobs.service.http.caller import (
+    AChanger,
+    ADeleter,
+    ASubmitter,
+    ATurn,
+    TheService,
+    check_changer,
+    set_audit_target,
+)
 from tune_jobs.service.http.models import (
     Change,
     NewSweep,
@@ -26,6 +33,7 @@ from tune_jobs.service.jobs import Job
 from tune_jobs.service.labels import NOTHING
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.service.service import Service
+from tune_jobs.service.statuses import Seen
 from tune_jobs.service.summaries import SweepSummary, check_sort, jobs_by_sweep, summary, trial_row, wanted_fields
 from tune_jobs.sweeps.plain import to_json
 
@@ -73,41 +81,56 @@ def submit(
     ] = None,
 ) -> Submitted:
     """Write a sweep, and let it wait for its turn."""
+
+    def say_whose(job: Job, created_at: float) -> None:
+        set_audit_target(request, job.sweep)
+        _say_whose(service, caller, new, job, created_at)
+
     job, is_new = service.submitter.submit(
         new.submission(),
         owner=caller.name,
         key=idempotency_key,
         check_room=lambda: _check_room(service, caller.name),
+        on_made=say_whose,
     )
     turn.end()
     set_audit_target(request, job.sweep)
-    _say_whose(service, caller, new, job, is_new=is_new)
     if is_new:
         service.supervisor.wake()
     else:
+        _say_whose_again(service, caller, new, job)
         response.status_code = 200
     response.headers["Location"] = f"/api/v1/sweeps/{job.sweep}"
     return Submitted(sweep=job.sweep, job=job)
 
 
-def _say_whose(service: Service, caller: Caller, new: NewSweep, job: Job, *, is_new: bool) -> None:
-    """Say whose the sweep of a job is.
+def _say_whose(service: Service, caller: Caller, new: NewSweep, job: Job, created_at: float) -> None:
+    service.labels.change(job.sweep, owner=caller.name, note=new.note, tags=new.tags, created_at=created_at)
 
-    The request that made it may have been killed before it could say so: one that repeats it does then.
+
+def _say_whose_again(service: Service, caller: Caller, new: NewSweep, job: Job) -> None:
+    """Say whose a sweep is that a repeated request asks for: the first one may have been killed before it did.
+
+    Raises:
+        CheckpointError: Nobody has said whose it is, and it can't be read, so this can't be said now, either.
     """
-    if not is_new:
-        # Whoever is creating it says so once it is written.
-        if job.state == "creating":
-            return
-        known = service.labels.of(job.sweep)
-        # What was said of a sweep that was created before is said of another one, whose name was free again.
-        if known.owner is not None and (known.created_at is None or known.created_at >= job.submitted_at):
-            return
-    # Its folder may have been removed since, and its name be another one's.
-    with contextlib.suppress(NotFoundError):
+    # Whoever is creating it says so once it is written.
+    if job.state == "creating":
+        return
+    known = service.labels.of(job.sweep)
+    # What was said of a sweep that was created before is said of another one, whose name was free again.
+    if known.owner is not None and (known.created_at is None or known.created_at >= job.submitted_at):
+        return
+    try:
         created_at = service.storage.sweep(job.sweep).read_record().created_at
-        if is_new or (job.submitted_at <= created_at and not job.is_of_former(created_at)):
-            service.labels.change(job.sweep, owner=caller.name, note=new.note, tags=new.tags, created_at=created_at)
+    except CheckpointError:
+        raise
+    except NotFoundError:
+        # Its folder has been removed since.
+        return
+    # Its name may be another one's.
+    if job.submitted_at <= created_at and not job.is_of_former(created_at):
+        _say_whose(service, caller, new, job, created_at)
 
 
 def _check_room(service: Service, owner: str) -> None:
@@ -206,31 +229,42 @@ def change(name: str, to: Change, service: TheService, _: AChanger) -> SweepSumm
 def delete(
     name: str,
     service: TheService,
-    _: AChanger,
+    caller: ADeleter,
     force: Annotated[bool, Query(description="Also one that has not finished, or is damaged.")] = False,  # noqa: FBT002
 ) -> None:
     """Delete a sweep with all that it has made."""
     stored = service.storage.sweep(name)
-    try:
-        seen = service.statuses.see(name)
-    except CheckpointError as error:
-        # Nothing says how far it got; to remove it, nothing of it has to be read.
-        if not force:
-            raise CheckpointError(error.message, f"{error.hint} With force=true, this deletes the sweep.") from error
-        seen = None
+    seen = _seen_to_delete(service, caller, name, force=force)
     if stored.is_driven() or service.queue.jobs("waiting", "running", "creating", sweep=name):
         raise NotNowError(f"Sweep {name} waits or runs.", "Stop it first.")
     if seen is not None and seen.status.state != "completed" and not force:
         raise NotNowError(
             f"Sweep {name} has not finished: it is {seen.status.state}.", "Resume it, or delete it with force=true."
         )
+    # A damaged one does not say when that was, nor may its label: then 0, before all sweeps.
+    created_at = seen.status.sweep.created_at if seen is not None else service.labels.of(name).created_at or 0.0
     stored.delete()
     if seen is not None:
         # It may have been run from a terminal, and nobody has asked for metrics since.
         service.env_steps.saw(seen)
     service.queue.remove_sweep(name)
-    service.labels.forget(name)
+    # Its name may be another one's by now.
+    service.labels.forget(name, created_at)
     service.statuses.forget(name)
+
+
+def _seen_to_delete(service: Service, caller: Caller, name: str, *, force: bool) -> Seen | None:
+    """Return a sweep that somebody may delete; None: it is damaged."""
+    try:
+        seen = service.statuses.see(name)
+    except CheckpointError as error:
+        # Nothing says how far it got; to remove it, nothing of it has to be read.
+        if not force:
+            raise CheckpointError(error.message, f"{error.hint} With force=true, this deletes the sweep.") from error
+        return None
+    # It may not have been readable when it was asked whose it is.
+    check_changer(service, caller, name, seen)
+    return seen
 
 
 @router.get("/sweeps/{name}/trials")

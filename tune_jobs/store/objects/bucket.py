@@ -21,6 +21,7 @@ from policies.files import atomic_path
 from tune_jobs.store.objects import clients
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.reasons import MISSING_BUCKET, NO_STORE, reason_of
+from tune_jobs.store.objects.scratch import filling
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.patience import ANSWER_S, AWAY, is_impatient
 
@@ -157,7 +158,7 @@ class Bucket:
             except FileNotFoundError as error:
                 self._refuse_missing_bucket(error)
                 return False
-            with atomic_path(path) as temporary, temporary.open("wb") as file:
+            with filling(), atomic_path(path) as temporary, temporary.open("wb") as file:
                 for part in answer.stream(min_chunk_size=2**22):
                     file.write(part)
             return True

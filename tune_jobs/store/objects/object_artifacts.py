@@ -16,14 +16,14 @@ from pydantic import BaseModel
 
 from analysis.best_records import BestRecord, FilmsRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
-from policies.files import atomic_path, write_atomic
+from policies.files import atomic_path
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Listed, Tag
 from tune_jobs.store.objects.parts import Parts
-from tune_jobs.store.objects.scratch import filling, make_local
+from tune_jobs.store.objects.scratch import filling, make_local, write_local
 from tune_jobs.store.record_files import dump_sealed
 
 
@@ -78,7 +78,7 @@ class Artifacts:
         key, text = f"{names.BEST_FOLDER}/{name}", dump_sealed(record)
         self._parts.write_record(key, text)
         made = self._parts.own() / "made" / name
-        write_atomic(made, text)
+        write_local(made, text)
         self._keep(key, made, self._parts.tag_of(key))
 
     def has_best(self) -> bool:

@@ -14,12 +14,12 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from policies.errors import NotFoundError, TuneJobsError
-from policies.files import open_to_append, write_atomic
+from policies.files import open_to_append
 from tune_jobs.store.objects.bucket import Bucket, ConflictError, Found, Listed, StorageError, Tag
 from tune_jobs.store.objects.held import held
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import ObjectOwner
-from tune_jobs.store.objects.scratch import filling, own_folder, shared_folder
+from tune_jobs.store.objects.scratch import filling, own_folder, shared_folder, write_local
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.record_files import dump, read_record
@@ -368,7 +368,7 @@ class Parts:
         found = self.bucket.get(key) if listed is not None else None
         if found is None:
             return local
-        write_atomic(copy, found.data)
+        write_local(copy, found.data)
         return copy
 
 

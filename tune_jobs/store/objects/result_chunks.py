@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from policies.files import write_atomic
 from tune_jobs.store.objects.bucket import Bucket
 from tune_jobs.store.objects.head import Chunk
+from tune_jobs.store.objects.scratch import write_local
 
 _SMALL_BYTES = 2**18
 """A last chunk that is smaller is written anew, with what is new."""
@@ -63,7 +63,7 @@ class ResultChunks:
             offset -= kept.pop().num_bytes
         new = Chunk(key=secrets.token_hex(8), num_bytes=len(content) - offset)
         self.bucket.put(self._object(new.key), content[offset:])
-        write_atomic(self.folder / new.key, content[offset:])
+        write_local(self.folder / new.key, content[offset:])
         return (*kept, new)
 
     def forget(self, keys: Iterable[str]) -> list[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import functools
 import hashlib
 import os
@@ -28,6 +29,7 @@ from tune_jobs.store.objects.url import ObjectUrl
 VARIABLE = "TUNE_JOBS_SCRATCH"
 """Where these folders are; without it, in the system's folder for temporary files."""
 _PROCESS = "process"
+_OF_A_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 _HINT = f"Free space there, or set {VARIABLE} to another folder that can be written."
 
 
@@ -49,7 +51,7 @@ def _own(pid: int) -> Path:
     """Return a new folder of this process alone; `pid` is its id, as a forked process needs another."""
     folder = _root() / f"of-{pid}-{secrets.token_hex(4)}"
     make_local(folder)
-    write_atomic(folder / _PROCESS, this_process())
+    write_local(folder / _PROCESS, this_process())
     _remove_abandoned()
     atexit.register(_remove, folder, pid)
     return folder
@@ -82,9 +84,27 @@ def filling() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise CannotRunError(
-            f"Files of this machine cannot be written to {_place()}: {_reason(error)}.", _HINT
-        ) from error
+        raise _cannot_fill(error) from error
+    except CannotRunError as error:
+        # As `write_atomic` and its like say it, of a file whose name tells a user nothing.
+        cause = error.__cause__
+        if not isinstance(cause, OSError) or cause.errno not in _OF_A_DISK:
+            raise
+        raise _cannot_fill(cause) from cause
+
+
+def write_local(path: Path, data: bytes | str) -> None:
+    """Write a file into one of these folders, as `write_atomic`.
+
+    Raises:
+        CannotRunError: It cannot be written.
+    """
+    with filling():
+        write_atomic(path, data)
+
+
+def _cannot_fill(error: OSError) -> CannotRunError:
+    return CannotRunError(f"Files of this machine cannot be written to {_place()}: {_reason(error)}.", _HINT)
 
 
 def _reason(error: OSError) -> str:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from policies.errors import CannotRunError, CheckpointError
-from policies.files import write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, StorageError, Tag
@@ -26,7 +25,7 @@ from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.result_chunks import ResultChunks
-from tune_jobs.store.objects.scratch import filling, make_local
+from tune_jobs.store.objects.scratch import filling, make_local, write_local
 from tune_jobs.store.trial_contract import Ownership
 from tune_jobs.store.trial_store import TrialStore
 
@@ -185,7 +184,7 @@ class TrialState:
     def _with_manifest(self, iteration: int, stored: StoredCheckpoint | None) -> Path:
         folder = self._local_checkpoint(iteration, stored)
         if stored is not None and not (folder / names.MANIFEST).exists():
-            write_atomic(folder / names.MANIFEST, stored.manifest)
+            write_local(folder / names.MANIFEST, stored.manifest)
         return folder
 
     def checkpoint_folder(self, iteration: int) -> Path:
@@ -245,7 +244,7 @@ class TrialState:
             with filling(), path.open("ab") as file:
                 file.write(content[len(present) :])
         else:
-            write_atomic(path, content)
+            write_local(path, content)
         return True
 
     # -- what is written

@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the column; what was said before counts for whatever has the name."""
+    """Add the column; the service's start says it of what was said before."""
     op.add_column("sweeps", sa.Column("created_at", sa.Float))
 
 
