@@ -70,3 +70,30 @@ def test_a_refused_token_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", init)
     with pytest.raises(CannotRunError, match="does not accept this machine's token"):
         cluster._join("host:6379")
+
+
+@pytest.mark.parametrize(("named", "is_refused"), [("", True), ("auto", True), ("192.0.2.9:6379", False)])
+def test_auto_joins_no_other_ray_of_this_machine_than_the_recorded_one_unless_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str, *, is_refused: bool
+) -> None:
+    from policies.errors import CannotRunError
+    from tune_jobs.ray_tune import cluster
+
+    class Context:
+        gcs_address = "192.0.2.9:6379"
+
+    left: list[str] = []
+    monkeypatch.setenv("RAY_ADDRESS", named)
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray" / "ray_current_cluster").write_text("192.0.2.7:6379")
+    monkeypatch.setattr(cluster, "check_is_ray", lambda _: None)
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.init", lambda address, **_: None)
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.get_runtime_context", Context)
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.ray.shutdown", lambda: left.append("it"))
+    if is_refused:
+        with pytest.raises(CannotRunError, match=r"last joined 192\.0\.2\.7:6379"):
+            cluster._join("auto")
+    else:
+        cluster._join("auto")
+    assert left == ["it"] * is_refused

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.cli.commands import cli
-from tune_jobs.ray_tune.address import check_address, recorded_cluster
+from tune_jobs.ray_tune.address import check_address, place_of, recorded_cluster
 
 
 @pytest.fixture
@@ -70,6 +70,16 @@ def test_auto_names_where_a_dead_address_comes_from(
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{dead_port}")
     with pytest.raises(CannotRunError, match="from RAY_ADDRESS"):
         check_address("auto")
+
+
+def test_auto_in_the_environment_is_the_recorded_cluster_as_for_ray(
+    ray_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "auto")
+    with pytest.raises(CannotRunError, match="RAY_ADDRESS names none"):
+        place_of("auto")
+    (ray_folder / "ray_current_cluster").write_text("192.0.2.7:6379")
+    assert place_of("auto") == ("192.0.2.7", 6379)
 
 
 @pytest.mark.parametrize(

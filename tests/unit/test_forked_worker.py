@@ -2,6 +2,7 @@
 
 import json
 import socket
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -92,3 +93,41 @@ def test_an_answer_counts_that_comes_before_who_asked_goes_on(
         thread.join(10)
     assert not thread.is_alive()
     assert told == [b"\n"] * num_answered
+
+
+FORKED = """\
+import os, resource, socket, sys
+from tune_jobs.ray_tune import fork_server, forked_worker
+program, address, told = sys.argv[1:]
+_, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+resource.setrlimit(resource.RLIMIT_NOFILE, (200, most))
+listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+listener.bind(address)
+listener.listen()
+pid = os.fork()
+if pid == 0:
+    connection, _ = listener.accept()
+    asked, streams = fork_server._receive(connection)
+    if told == "other things":
+        del asked["files"]
+    connection.sendall(b"7")
+    connection.recv(1)
+    fork_server._work(asked, streams)
+    os._exit(0)
+resource.setrlimit(resource.RLIMIT_NOFILE, (300, most))
+assert forked_worker.ask(address, [program])
+os.waitpid(pid, 0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
+@pytest.mark.parametrize(("told", "expected"), [("the limit", 300), ("other things", 200)])
+def test_a_forked_process_may_open_as_many_files_as_who_asked(tmp_path: Path, told: str, expected: int) -> None:
+    """Ray raises the limit when it is joined, and what processes are forked from was started before."""
+    program = tmp_path / "default_worker.py"
+    program.write_text("import resource; print(resource.getrlimit(resource.RLIMIT_NOFILE)[0], flush=True)")
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED, str(program), str(tmp_path / "asked"), told],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.stdout == f"{expected}\n", done.stderr

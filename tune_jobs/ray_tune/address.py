@@ -81,6 +81,12 @@ def recorded_cluster() -> str | None:
         return None
 
 
+def named_cluster() -> str | None:
+    """Return the address of a cluster that RAY_ADDRESS names; `auto` is none, which Ray looks for as without it."""
+    address = os.environ.get("RAY_ADDRESS")
+    return None if address == "auto" else address or None
+
+
 def _record_path() -> Path:
     # The file where Ray 2.60 keeps it (ray._common.utils.get_ray_address_file), found without importing ray.
     folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"  # noqa: S108 (Ray's own default)
@@ -89,14 +95,14 @@ def _record_path() -> Path:
 
 def _find_cluster() -> tuple[str, str]:
     """Return the address that `auto` means, and words for messages that say where it comes from."""
-    address = os.environ.get("RAY_ADDRESS")
-    if address:
+    address = named_cluster()
+    if address is not None:
         return address, " (from RAY_ADDRESS)"
     address = recorded_cluster()
     if address is None:
         # Ray would now join any Ray among this machine's processes, such as that of another sweep, which ends with it.
         raise CannotRunError(
-            "No Ray cluster is known on this machine: RAY_ADDRESS is not set, and `ray start` left no address in "
+            "No Ray cluster is known on this machine: RAY_ADDRESS names none, and `ray start` left no address in "
             f"{_record_path()}.",
             "Start one (`ray start --head`), name it with --address HOST:PORT or ray://HOST:PORT, or leave --address "
             "out to run on this machine alone.",

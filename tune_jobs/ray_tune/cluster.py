@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
-import os
 import signal
 import tempfile
 import threading
@@ -23,7 +22,7 @@ from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
 from tune_jobs.process.streams import quiet
-from tune_jobs.ray_tune.address import recorded_cluster
+from tune_jobs.ray_tune.address import named_cluster, recorded_cluster
 from tune_jobs.ray_tune.answering import check_is_ray, wrong_token
 from tune_jobs.ray_tune.connected_ray import (
     check_connected_to,
@@ -181,7 +180,7 @@ def _join(address: str) -> None:
                 "host:port is for machines that are nodes of the cluster; others join by ray://HOST:10001.",
             ) from error
     joined = ray.get_runtime_context().gcs_address if address == "auto" else None
-    if joined is not None and not os.environ.get("RAY_ADDRESS") and joined != recorded_cluster():
+    if joined is not None and named_cluster() is None and joined != recorded_cluster():
         # Ray 2.60 prefers a single cluster among this machine's processes, such as another sweep's, which ends with it.
         ray.shutdown()
         raise CannotRunError(

@@ -22,6 +22,7 @@ import gc
 import importlib
 import json
 import os
+import resource
 import runpy
 import select
 import signal
@@ -205,6 +206,9 @@ def _work(asked: Mapping[str, Any], streams: list[int]) -> None:
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(asked["oom_score_adj"], encoding="ascii")
+    with contextlib.suppress(KeyError, OSError, ValueError):
+        # Ray raises its processes' limit of open files after this process has begun.
+        resource.setrlimit(resource.RLIMIT_NOFILE, tuple(asked["files"]))
     program, *options = asked["command"]
     sys.argv[:] = [program, *options]
     # As Python does when it starts; the folders of the user's modules come to PYTHONPATH after this process began.

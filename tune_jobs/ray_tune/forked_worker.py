@@ -11,6 +11,7 @@ import array
 import contextlib
 import json
 import os
+import resource
 import signal
 import socket
 import sys
@@ -58,6 +59,7 @@ def ask(address: str, command: list[str]) -> bool:
             if signal.getsignal(number) is signal.SIG_IGN
         ],
         "oom_score_adj": score,
+        "files": resource.getrlimit(resource.RLIMIT_NOFILE),
     }
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:

@@ -133,20 +133,22 @@ class PackLoop:
         self._members[task.trial_id] = member = TrialInPack(task, before.num_failures)
         member.hold(before.hold_at)
         if before.loop is not None:
-            before.close()
+            with self._watch(task.iteration_timeout_s):
+                before.close()
 
     def end(self, trial_id: str) -> None:
         """Save a member and remove it; it is reported as stopped. One that waits is saved, and nothing is reported."""
         member = self._members[trial_id]
-        if member.loop is None or member.waits:
-            del self._members[trial_id]
-            if member.loop is not None:
-                # It may be trained by another pack already.
-                with contextlib.suppress(OwnershipLostError):
-                    member.close()
-        else:
-            leave = {member: lambda: member.trial.leave("stopped")}
-            self._attempt(leave, saves=False, leaves=True)
+        with self._watch(member.task.iteration_timeout_s):
+            if member.loop is None or member.waits:
+                del self._members[trial_id]
+                if member.loop is not None:
+                    # It may be trained by another pack already.
+                    with contextlib.suppress(OwnershipLostError):
+                        member.close()
+            else:
+                leave = {member: lambda: member.trial.leave("stopped")}
+                self._attempt(leave, saves=False, leaves=True)
 
     def save(self) -> None:
         """Save every member that has trained, as this process is about to end."""
@@ -180,13 +182,20 @@ class PackLoop:
                 if any(report.waits for report in self._reports) or all(member.waits for member in self._all):
                     break
         finally:
-            self._attempt({member: member.trial.flush for member in self._all if member.loop}, saves=False)
+            self._flush()
         for member in self._members.values():
             if member.unreported is not None:
                 self._reports.append(MemberReport(member.task.trial_id, member.trial.told(member.unreported)))
                 member.unreported = None
         reports, self._reports = self._reports, []
         return reports
+
+    def _flush(self) -> None:
+        acts = {member: member.trial.flush for member in self._all if member.loop}
+        if acts:
+            # Where it fails, the member is closed.
+            with self._watch(max(member.task.iteration_timeout_s for member in acts)):
+                self._attempt(acts, saves=False)
 
     def _idle(self) -> None:
         """Wait a moment if there is nothing to train, and longer each time."""
@@ -298,16 +307,17 @@ class PackLoop:
             # Side by side, as the store may be far away; they are built one after the other, in their order.
             taken = list(self._writers.map(_outcome, [member.trial.take_over for member in new]))
         for member, outcome in zip(new, taken, strict=True):
-            try:
-                if isinstance(outcome, Exception):
-                    raise outcome  # noqa: TRY301 (told as what `build` raises)
-                with self._watch(member.task.iteration_timeout_s):
+            # What fails is closed, which may hang as well.
+            with self._watch(member.task.iteration_timeout_s):
+                try:
+                    if isinstance(outcome, Exception):
+                        raise outcome  # noqa: TRY301 (told as what `build` raises)
                     member.trial.build()
-                if member.waits:
-                    # Its process died while it waited.
-                    self._told(member, member.trial.where())
-            except Exception as error:  # noqa: BLE001 (it must not end the others)
-                self._failed(member, error)
+                    if member.waits:
+                        # Its process died while it waited.
+                        self._told(member, member.trial.where())
+                except Exception as error:  # noqa: BLE001 (it must not end the others)
+                    self._failed(member, error)
 
     def _failed(self, member: TrialInPack, error: Exception, *, leaves: bool = False) -> None:
         """Report a failure; the member is opened again if it may be retried and need not leave."""
