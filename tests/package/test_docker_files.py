@@ -1,6 +1,7 @@
 """What the Docker files promise, read from them."""
 
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -145,6 +146,17 @@ def test_the_bucket_is_where_every_process_looks_with_the_keys_of_its_server() -
             for variable in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
                 assert service["environment"][variable] == server["environment"][variable] == variables[variable]
             assert service["environment"]["TUNE_JOBS_STORAGE"] == variables["TUNE_JOBS_STORAGE"]
+
+
+def test_no_up_leaves_a_service_of_before_on_its_old_settings_or_begins_more_than_is_asked_for() -> None:
+    readme = (DOCKER / "README.md").read_text()
+    workers_later = re.findall(r"More workers later: `up ([^`]*)`", readme)
+    # With no service named, `service` would begin too.
+    assert [words.split()[-1] for words in workers_later] == ["worker"]
+    with_database = re.findall(r"--profile postgresql up --detach (.*)", readme)
+    assert len(with_database) == 2
+    # Else a service that runs would stay on SQLite, and refuse the token that is in PostgreSQL.
+    assert not any("--no-recreate" in words for words in with_database)
 
 
 def schema() -> Draft202012Validator:

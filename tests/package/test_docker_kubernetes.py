@@ -276,35 +276,24 @@ def test_a_job_resumes_its_sweep_or_launches_it(folder: str, kind: str) -> None:
     assert load_spec(FOLDER / folder / "sweep.yaml").algorithm == "ppo"
 
 
-@pytest.mark.parametrize(("folder", "kind"), [("sweep", "RayJob"), ("nightly", "RayCronJob")])
-@pytest.mark.parametrize(
-    ("codes", "code"),
-    [([0], 0), ([3], 0), ([4, 0], 0), ([4, 3], 0), ([4, 2], 2), ([4, 5], 5), ([2], 2), ([5], 5), ([130], 130)],
-)
-def test_a_job_fails_unless_its_sweep_is_over(
-    folder: str, kind: str, codes: list[int], code: int, tmp_path: Path
-) -> None:
-    """As Ray's job server runs the entrypoint: with a shell, and what it prints is the job's log."""
-    (manifest,) = of_kind(render(FOLDER / folder, component=FOLDER / "storage-pvc"), kind)
-    entrypoint = manifest["spec"].get("jobTemplate", manifest["spec"])["entrypoint"]
-    program = tmp_path / "tune-jobs"
-    program.write_text(f'#!/bin/sh\necho "$1 $2 $4"\n[ "$1" = resume ] && exit {codes[0]}\nexit {codes[-1]}\n')
-    program.chmod(0o755)
-    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    done = subprocess.run(["/bin/sh", "-c", entrypoint], env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (code, "")
-    first, *rest = done.stdout.splitlines()
-    name = first.split()[1]
-    assert first.startswith(f"resume {name}")
-    assert re.fullmatch(r"cartpole(-\d{4}-\d\d-\d\d)?", name)
-    if len(codes) == 2:
-        assert rest.pop(0) == f"launch /files/sweep.yaml {name}"
-    if codes[-1] == 3:
-        (said,) = rest
-        assert said.startswith(f"The sweep {name} is over, but trials failed")
-        assert said.endswith(f"tune-jobs trials {name}")
-    else:
-        assert rest == []
+def test_a_new_version_takes_the_place_of_the_old_ones_cluster_and_service() -> None:
+    manifests = render(FOLDER / "service", component=FOLDER / "storage-pvc")
+    (deployment,) = of_kind(manifests, "Deployment")
+    (cluster,) = of_kind(manifests, "RayCluster")
+    told = (ROOT / "docker" / "README.md").read_text().partition("*A new version*")[2].partition("\n- ")[0]
+    named = re.findall(
+        r"scale deploy/(\S+) --replicas=0|--selector=(\S+)|delete raycluster (\S+)|apply --kustomize (\S+)", told
+    )
+    label = "app.kubernetes.io/component"
+    pod = deployment["spec"]["template"]
+    # The sweeps save before their cluster goes; applied, the manifest begins the service again.
+    assert ["".join(one) for one in named] == [
+        deployment["metadata"]["name"], f"{label}={pod['metadata']['labels'][label]}", cluster["metadata"]["name"],
+        str((FOLDER / "service").relative_to(ROOT)),
+    ]  # fmt: skip
+    assert deployment["spec"]["replicas"] == 1
+    (timeout_s,) = re.findall(r"--timeout=(\d+)s", told)
+    assert int(timeout_s) > pod["spec"]["terminationGracePeriodSeconds"]
 
 
 def test_the_service_is_asked_for_what_it_has(storage: str) -> None:

@@ -134,6 +134,31 @@ def test_a_job_that_fails_at_once_leaves_nothing(
     assert list((tmp_path / "s").iterdir()) == []
 
 
+def test_a_new_sweep_whose_job_fails_is_to_be_launched_again(head: Head, tmp_path: Path) -> None:
+    head.on_submit = lambda body: failed("runtime_env setup failed: no such package", None)
+    done = launch(head, "--detach")
+    assert (done.exit_code, "Nothing was kept; launch it again." in done.stderr) == (5, True), done.stderr
+    assert "resume" not in done.stderr
+    assert list((tmp_path / "s").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("resume",), ("extend", "--num-samples", "2"), ("replicate", "--top", "2"), ("inject", "lr=0.003")],
+)
+def test_a_sweep_that_was_there_before_its_job_stays_if_that_fails(
+    head: Head, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    created = verbs.create("mine.yaml", name="mine", storage="s")
+    head.on_submit = lambda body: failed("runtime_env setup failed: no such package", None)
+    verb, *options = words
+    done = run(verb, "mine", *options, "--storage", "s", "--address", head.address, "--detach")
+    assert (done.exit_code, "no such package" in done.stderr) == (5, True), done.stderr
+    assert SweepStore(created.folder).read_record().state == "created"
+    hint = done.stderr.partition("Continue with `tune-jobs resume ")[2]
+    assert hint.endswith(f"mine --address {head.address} --detach`.\n")
+
+
 def test_a_refused_job_leaves_nothing(head: Head, tmp_path: Path) -> None:
     def refuse(body: dict[str, Any]) -> dict[str, Any]:
         raise ValueError("runtime_env is bad")

@@ -42,6 +42,8 @@ class DetachedSweep:
     place: str
     """Where it is, for this machine and for the cluster's nodes."""
     job: JobRecord
+    is_new: bool
+    """Whether it was written for this job; one that was there before is not removed if the job fails."""
 
 
 @allowed_again()
@@ -84,7 +86,7 @@ def launch_detached(
             with store.lock():
                 store.write_record(store.read_record().model_copy(update={"job": job}))
             _submit(api, store, job, ["resume", *_waiting(wait_for_nodes)], content, finish=finish)
-    return DetachedSweep(store.name, created.place, job)
+    return DetachedSweep(store.name, created.place, job, is_new=True)
 
 
 def go_on_detached(
@@ -131,7 +133,7 @@ def go_on_detached(
         api.ray_version()
         job = _new_job(store, address)
         _submit(api, store, job, [verb, *options, *_waiting(wait_for_nodes)], content, finish=finish)
-    return DetachedSweep(store.name, store.place, job)
+    return DetachedSweep(store.name, store.place, job, is_new=False)
 
 
 def wait_until_begun(detached: DetachedSweep, *, timeout_s: float = _BEGIN_S) -> JobState:
@@ -153,7 +155,8 @@ def wait_until_begun(detached: DetachedSweep, *, timeout_s: float = _BEGIN_S) ->
             state = state if found is None else found.status
             if found is not None and found.has_ended:
                 if not ran(found):
-                    _forget(store)
+                    if detached.is_new:
+                        _forget(store)
                     raise failure_of(store, detached.job, found)
                 return state
             record = store.read_record()
@@ -187,13 +190,14 @@ def told_of(job: Job | None) -> str:
 def failure_of(store: Sweep, job: JobRecord, found: Job) -> TuneJobsError:
     """Return the error that a job ended with: its own words, where it has said some."""
     said, hint = _said(found.message or "")
-    again = f"Continue with `tune-jobs resume {name_in_commands(store.place)} --address {job.address} --detach`."
     kind = {2: SpecError, 4: NotFoundError}.get(found.driver_exit_code or 0, CannotRunError)
     if found.driver_exit_code == NotFoundError.exit_code:
         kind, hint = CannotRunError, "The storage folder has to be the same on this machine and on the cluster's nodes."
     elif found.driver_exit_code == 127:
         hint = "tune-jobs has to be installed on the cluster's head, and to be found on its PATH."
-    return kind(f"Job {job.id} of sweep {store.name}, at {job.address}, failed: {said}", hint or again)
+    return kind(
+        f"Job {job.id} of sweep {store.name}, at {job.address}, failed: {said}", hint or _how_to_go_on(store, job)
+    )
 
 
 def cancel_waiting(store: Sweep) -> bool:
@@ -204,6 +208,14 @@ def cancel_waiting(store: Sweep) -> bool:
         return False
     with JobsApi(job.address) as api:
         return api.stop(job.id)
+
+
+def _how_to_go_on(store: Sweep, job: JobRecord) -> str:
+    # The storage may not answer: that is not the error to be told.
+    with contextlib.suppress(TuneJobsError):
+        if not store.exists():
+            return "Nothing was kept; launch it again."
+    return f"Continue with `tune-jobs resume {name_in_commands(store.place)} --address {job.address} --detach`."
 
 
 def _said(message: str) -> tuple[str, str]:

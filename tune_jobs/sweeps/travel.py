@@ -34,7 +34,8 @@ def packed(folder: Path) -> bytes:
     """Return a folder as a zip file, the same for the same files.
 
     Left out is what no module is, and what may be secret or large: hidden files and folders (.git, .env, .venv),
-    virtual environments, folders of sweeps, caches, and links to what lies outside of the folder.
+    virtual environments, folders of sweeps, caches, links to any of these and to what lies outside of the folder, and
+    names that are not UTF-8. Other links travel as what they lead to.
 
     Raises:
         SpecError: It holds more than 100 MiB.
@@ -61,12 +62,17 @@ def packed(folder: Path) -> bytes:
 
 def _files(folder: Path) -> Iterator[Path]:
     inside = folder.resolve()
-    for root, folders, names in os.walk(folder, onerror=_raise):
+    for root, folders, names in os.walk(folder, onerror=_raise, followlinks=True):
         here = Path(root)
-        folders[:] = [name for name in folders if not _stays_here(here / name)]
+        way = {path.resolve() for path in (here, *here.parents) if path.is_relative_to(folder)}
+        # A link to where the walk came through would be followed for ever.
+        folders[:] = [
+            name for name in folders if _leads_to_own(here / name, inside)
+            and not _stays_here(here / name) and (here / name).resolve() not in way
+        ]  # fmt: skip
         for name in names:
             path = here / name
-            if not name.startswith(".") and path.is_file() and path.resolve().is_relative_to(inside):
+            if not _is_unfit(name) and path.is_file() and _leads_to_own(path, inside):
                 yield path
 
 
@@ -74,8 +80,27 @@ def _raise(error: OSError) -> None:
     raise error
 
 
+def _leads_to_own(path: Path, inside: Path) -> bool:
+    """Whether a path is no link, or leads to what lies in the folder and does not stay here under its own name."""
+    if not path.is_symlink():
+        return True
+    real = path.resolve()
+    if not real.is_relative_to(inside) or _is_unfit(real.name):
+        return False
+    return not any(_stays_here(one) for one in (real, *real.parents) if one.is_dir() and inside in one.parents)
+
+
+def _is_unfit(name: str) -> bool:
+    """Whether a name is hidden, or not UTF-8, as a zip file's have to be; no module has such a one."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return True
+    return name.startswith(".")
+
+
 def _stays_here(folder: Path) -> bool:
-    if folder.name.startswith(".") or folder.name in _LEFT_OUT or (folder / "pyvenv.cfg").exists():
+    if _is_unfit(folder.name) or folder.name in _LEFT_OUT or (folder / "pyvenv.cfg").exists():
         return True
     # A sweep, or a storage folder of sweeps.
     return open_sweep(folder).exists() or any(
