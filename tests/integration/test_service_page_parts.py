@@ -5,6 +5,8 @@ from typing import Any
 import pytest
 from live_service import Live
 from page_browser import IN_A_BROWSER, Page
+from page_sweeps import write_sweep
+from synthetic_sweep import make_sweep
 
 from analysis.wording import setting_text, short_text
 
@@ -75,6 +77,84 @@ CONDITIONS = """
     return given.map(({ space, values }) =>
       [module.numCombinations(space), values.map((each) => module.acts(space, "num_epochs", { hidden_sizes: each }))]);
 """
+UNSET = """
+    const [space, points] = given;
+    const of = (name) => import(new URL(`static/js/${name}.js`, document.baseURI));
+    const names = ["trial_columns", "filter", "parallel", "format", "chosen_point"];
+    return Promise.all(names.map(of)).then((modules) => {
+      const [{ columnsOf }, { filterOf }, { Parallel }, { pointText }, { pointDialog }] = modules;
+      const trials = points.map((point, index) => ({
+        trial_id: String(index), index, point_index: index, seed_index: 0, point,
+        score: 10 * index, status: "completed",
+      }));
+      const data = Object.assign(new module.SweepData(null), { trials, spec: { space }, summary: {} });
+      const [axis, score] = [data.axes[0], data.axes.at(-1)];
+      const ids = (found) => found.map((trial) => trial.trial_id).join("");
+      const columns = columnsOf(data.searched, false);
+      const drawn = [];
+      const nothing = () => {};
+      const lineTo = (left, top) => drawn.push(Number.isFinite(top));
+      const context = { beginPath: nothing, stroke: nothing, moveTo: nothing, lineTo };
+      Object.assign(axis, { left: 0 });
+      Object.assign(score, { left: 100 });
+      const parallel = { axes: [axis, score], trials, matching: new Set(trials.map((trial) => trial.trial_id)) };
+      Parallel.prototype.trace.call(parallel, context, trials, false);
+      const near = trials.map((trial) => [30, 284].map((top) => Parallel.prototype.nearest.call(parallel, 100, top)));
+      const dialog = pointDialog({ name: "a", spec: { space }, trials, post: null });
+      return {
+        ticks: axis.ticks.map(({ text }) => text),
+        places: trials.map((trial) => axis.place(axis.valueOf(trial)) ?? null),
+        unscored: score.place(null) ?? null,
+        lines: drawn,
+        near: near[0],
+        range: axis.rangeText(-0.1, 0.1),
+        cells: trials.map((trial) => columns.find(({ key }) => key === axis.name).text(trial)),
+        filtered: ["=null", "!=null", "=0.5", "!=0.5", "<1"].map((test) =>
+          ids(trials.filter(filterOf(axis.name + test, columns)))),
+        told: pointText(points[0]),
+        filled: dialog.fields[0].value ?? null,
+      };
+    });
+"""
+AXIS_TICKS = """
+    const [kind, values] = given;
+    const trials = values.map((x) => ({ point: { x }, score: null }));
+    return module.axesOf([{ name: "x", kind, values: [] }], trials)[0].ticks.map(({ text }) => text);
+"""
+TICKS = """
+    const host = document.querySelector("main");
+    host.replaceChildren();
+    const texts = [];
+    const { fillText } = CanvasRenderingContext2D.prototype;
+    CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+      texts.push(text);
+      return fillText.call(this, text, ...place);
+    };
+    const frames = (left, then) => (left ? requestAnimationFrame(() => frames(left - 1, then)) : then());
+    const drawn = (show) => new Promise((resolve) => {
+      frames(3, () => {
+        texts.length = 0;
+        show();
+        frames(3, () => resolve([...texts]));
+      });
+    });
+"""
+PLOT_TICKS = f"""{TICKS}
+    const plot = new module.Plot(host, {{ label: "A", height: 300, paint() {{}}, find: () => null }});
+    return drawn(() => plot.setRange({{ x: given, y: given }}));
+"""
+FRONT_TICKS = """
+    const host = document.querySelector("main");
+    const chart = new module.FrontChart(host, { onOpen() {} });
+    return given.map((values) => chart.plot.u.axes[0].values(chart.plot.u, values));
+"""
+TIMELINE_TICKS = f"""{TICKS}
+    host.style.width = "1000px";
+    const timeline = new module.Timeline(host, {{ isOpen: true, onOpen() {{}} }});
+    const trials = [{{ trial_id: "t0000", index: 0, status: "completed", started_at: 1e9, ended_at: 1e9 + 86400 * given,
+      node: "a", pid: 1, num_env_steps: 1, score: null }}];
+    return drawn(() => timeline.show({{ data: {{ trials, now: () => 2e9 }}, matching: trials }}));
+"""
 
 
 def run_module(page: Page, name: str, script: str, given: Any) -> Any:
@@ -128,6 +208,68 @@ def test_what_is_nearly_one_has_the_digits_that_the_command_line_gives(page: Pag
     values = [0.9, 0.9904, 0.99, 0.9994, 0.9995537, 0.99999, 0.95, 0.912345, 0.89, 1.0, 0.5, 123.456]
     told = run_module(page, "format", NEAR_ONE, values)
     assert told == [[short_text(value), setting_text(value)] for value in values]
+
+
+def test_a_searched_null_is_a_value_and_not_what_does_not_act(page: Page) -> None:
+    points: list[dict[str, Any]] = [{"grad_clip": None}, {"grad_clip": 0.5}, {"lr": 1}, {"grad_clip": None}]
+    told = run_module(page, "sweep_data", UNSET, [{"grad_clip": {"grid": [None, 0.5]}, "lr": {"grid": [1]}}, points])
+    assert told == {
+        "ticks": ["not set", "0.5"], "places": [0, 1, None, 0], "unscored": None,
+        # Those with a value of both axes, by which a line is found, too.
+        "lines": [True] * 3, "near": ["3", "0"],
+        "range": "not set", "cells": ["not set", "0.5", "", "not set"],
+        "filtered": ["03", "12", "1", "03", "1"], "told": "grad_clip not set", "filled": None,
+    }  # fmt: skip
+
+
+def test_a_null_beside_a_range_has_no_place_on_it(page: Page) -> None:
+    points: list[dict[str, Any]] = [{"lr": None}, {"lr": 0.1}, {"lr": 0.001}]
+    told = run_module(page, "sweep_data", UNSET, [{"lr": {"loguniform": [0.001, 0.1]}}, points])
+    assert told["places"] == [None, 1, 0]
+    assert told["cells"] == ["not set", "0.1", "0.001"]
+    assert told["lines"] == [True] * 2
+
+
+def test_a_range_of_what_is_not_set_keeps_its_trials(page: Page, live: Live) -> None:
+    values: list[Any] = [None, 0.5, None, 0.5, 1.0]
+    made = make_sweep(name="clipped", points=[{"grad_clip": value} for value in values], with_best=False)
+    write_sweep(live.storage, made, spec={"space": {"grad_clip": {"grid": [None, 0.5, 1.0]}}})
+    page.open("#/sweeps/clipped?in.grad_clip=not+set")
+    page.says(".trials-card", "2 of 5 trials")
+    assert page.text(".trials-card").count("not set") == 2
+
+
+def test_ticks_beside_each_other_have_different_labels(page: Page) -> None:
+    given = [[498, 498.5, 499, 499.5, 500], [1_200_000, 1_202_000, 1_204_000], [495, 497.5, 500], [0, 0.5, 1], [7], []]
+    assert run_module(page, "front_chart", FRONT_TICKS, given) == [
+        ["498", "498.5", "499", "499.5", "500"], ["1.2M", "1.202M", "1.204M"], ["495", "497.5", "500"],
+        ["0", "0.5", "1"], ["7"], [],
+    ]  # fmt: skip
+    told = run_module(page, "plot", PLOT_TICKS, [498, 500])
+    assert {"498.5", "499", "499.5", "500"} <= set(told)
+    whole = run_module(page, "plot", PLOT_TICKS, [15_000, 15_200])
+    assert {"15.05K", "15.1K", "15.15K"} <= set(whole)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "ticks"),
+    [
+        ("linear", [199, 201], ["199", "199.5", "200", "200.5", "201"]),
+        ("linear", [0, 1000], ["0", "500", "1000"]),
+        ("linear", [0.12, 0.121], ["0.12", "0.1205", "0.121"]),
+        ("log", [1e-5, 1e-2], ["1e-5", "1e-4", "0.001", "0.01"]),
+        ("near one", [0.9, 0.9999], ["0.9999", "0.999", "0.99", "0.9"]),
+    ],
+)
+def test_ticks_of_an_axis_of_values_have_different_labels(
+    page: Page, kind: str, values: list[float], ticks: list[str]
+) -> None:
+    assert run_module(page, "parallel_axes", AXIS_TICKS, [kind, values]) == ticks
+
+
+@pytest.mark.parametrize(("days", "tick"), [(3, "2 d"), (30, "20 d"), (2000, "1000 d")])
+def test_a_timeline_of_weeks_has_its_axis(page: Page, days: int, tick: str) -> None:
+    assert tick in run_module(page, "timeline", TIMELINE_TICKS, days)
 
 
 def test_a_condition_may_name_a_list_of_one_layer_by_its_number(page: Page) -> None:

@@ -11,9 +11,12 @@ export class Refused extends Error {
 }
 
 export class Unreachable extends Error {
-  constructor() {
+  // What somebody has sent is not sent again by itself.
+  constructor({ isSent = false } = {}) {
     super("The service can't be reached.");
-    this.hint = "Check that it runs; the page goes on by itself once it answers.";
+    this.hint = isSent
+      ? "Check that it runs, then try again."
+      : "Check that it runs; the page goes on by itself once it answers.";
     this.problems = [];
   }
 }
@@ -45,7 +48,7 @@ export async function answerTo(path, { method = "GET", query = {}, body, headers
     answer = await fetch(url, request);
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Unreachable();
+    throw new Unreachable({ isSent: method !== "GET" });
   }
   if (!answer.ok) {
     const refused = new Refused(answer.status, await problemOf(answer));

@@ -40,7 +40,7 @@ function bestPoint(trials) {
 function fieldOf(name, space, known) {
   const domain = space[name];
   const kind = kindOf(domain);
-  const value = known ?? middleOf(domain);
+  const value = known === undefined ? middleOf(domain) : known;
   const common = { name: PREFIX + name, label: name, value };
   const needs = neededText(space, name, (each) => settingText(each));
   const when = needs ? ` Acts only with ${needs}.` : "";

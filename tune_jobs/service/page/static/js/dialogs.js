@@ -131,11 +131,16 @@ export function refusal(error) {
   return lines;
 }
 
-// What is asked for again and again until the service has it, in a box that stands where it would be.
-export function notYet(error) {
-  const again = error.status >= 500 ? el("p", { class: "quiet" }, "The page goes on by itself once it is there.") : null;
-  return el("div", { class: "notice bad" }, refusal(error), again);
+export const GOES_ON = "The page goes on by itself once it is there.";
+
+// What is asked for again and again until the service has it.
+export function awaited(error) {
+  const again = error.status >= 500 ? [el("p", { class: "quiet" }, GOES_ON)] : [];
+  return [...refusal(error), ...again];
 }
+
+// The same, in a box that stands where it would be.
+export const notYet = (error) => el("div", { class: "notice bad" }, awaited(error));
 
 // A place for what was refused outside of a dialog; it stays until it is closed.
 export function makeAlert() {

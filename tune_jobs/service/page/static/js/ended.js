@@ -3,6 +3,11 @@ const ENDED = ["completed", "failed", "stopped"];
 
 export class Ended {
   constructor() {
+    this.forget();
+  }
+
+  // What was asked for did not come, or is of another sweep now: it is due as if it was never asked for.
+  forget() {
     this.seen = -1;
     this.state = "";
   }

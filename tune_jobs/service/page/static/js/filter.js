@@ -24,14 +24,18 @@ function testOf(word, columns) {
     const wanted = word.toLowerCase();
     return (row) => columns.some((known) => known.text(row).toLowerCase().includes(wanted));
   }
+  const isUnset = column.isUnset ?? (() => false);
   if (limit.trim() === "" || Number.isNaN(Number(limit))) {
-    const same = (row) => column.text(row).toLowerCase() === limit.toLowerCase();
+    // As the sweep file writes it.
+    const wantsUnset = limit.toLowerCase() === "null";
+    const same = (row) => column.text(row).toLowerCase() === limit.toLowerCase() || (wantsUnset && isUnset(row));
     if (sign === "=") return same;
     return sign === "!=" ? (row) => !same(row) : () => false;
   }
   return (row) => {
     const value = column.value(row);
     if (typeof value === "number") return COMPARE[sign](value, Number(limit));
+    if (isUnset(row)) return sign === "!=";
     return value !== null && ["=", "!="].includes(sign) && COMPARE[sign](column.text(row), limit);
   };
 }

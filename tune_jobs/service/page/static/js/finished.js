@@ -1,4 +1,5 @@
 // What a finished sweep has come to: the policy to deploy, the setting to train with, its report and films.
+import { Again } from "./again.js";
 import { el } from "./dom.js";
 import { count, counted, pointText, rangeText, returnText } from "./format.js";
 import { playLink } from "./play_links.js";
@@ -18,21 +19,32 @@ export class Finished {
     Object.assign(this, { card, source, onOpen });
     this.card.hidden = true;
     this.stamp = "";
+    this.sweep = null;
+    this.again = new Again(() => this.follow(this.sweep));
   }
 
   // Asked for once each time the sweep has come to an end, or goes on: what it came to before is shown until then.
   async follow(sweep) {
+    this.sweep = sweep;
     // Its group is another one when the process has ended, which writes the result after the trials.
     const stamp = `${stateOf(sweep).group} ${sweep.state} ${sweep.ended_at} ${sweep.job?.ended_at}`;
-    if (stamp === this.stamp) return;
+    if (stamp === this.stamp || this.again.isWaiting) return;
     this.stamp = stamp;
     try {
       const { files, best } = await this.source.outcome();
-      if (stamp === this.stamp) this.show(files, best, toldAsEarlier(sweep, this.source.isFile));
-    } catch {
-      // The next look asks again.
+      if (stamp !== this.stamp) return;
+      this.again.reset();
+      this.show(files, best, toldAsEarlier(sweep, this.source.isFile));
+    } catch (error) {
+      if (stamp !== this.stamp) return;
+      // The next look asks again: of a sweep that has ended there is none but this one.
       this.stamp = "";
+      this.again.failed(error);
     }
+  }
+
+  close() {
+    this.again.close();
   }
 
   // `earlier` says that all this may be of before, if so.

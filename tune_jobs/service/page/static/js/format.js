@@ -1,16 +1,36 @@
 // Numbers, times and values as texts, as the report and the command line write them.
 export const NONE = "–";
+// A value that is searched and is none: the report has the same words for it.
+export const NOT_SET = "not set";
 const whole = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const tenths = new Intl.NumberFormat("en", { minimumFractionDigits: 1, maximumFractionDigits: 1 });
 const thousandths = new Intl.NumberFormat("en", { minimumFractionDigits: 3, maximumFractionDigits: 3 });
 const tiny = new Intl.NumberFormat("en", { minimumSignificantDigits: 3, maximumSignificantDigits: 3 });
 const short = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits: 3 });
+const MOST_DIGITS = 12;
 const day = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit" });
 const date = new Intl.DateTimeFormat("en-GB", { dateStyle: "long", timeStyle: "medium" });
 
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 export const count = (value) => (isNumber(value) ? whole.format(value) : NONE);
 export const compact = (value) => (isNumber(value) ? short.format(value) : NONE);
+
+// The digits of numbers beside each other, as at an axis: three, or as many as it takes to say where each of them lies.
+export function enoughDigits(values) {
+  const numbers = [...new Set(values.filter(isNumber))].sort((a, b) => a - b);
+  const least = Math.min(...numbers.slice(1).map((value, index) => value - numbers[index]));
+  // To be told apart is not enough: 495, 497.5 and 500 would be 495, 498 and 500.
+  const isNear = (value, digits) => Math.abs(Number(value.toPrecision(digits)) - value) <= 0.05 * least;
+  let digits = 3;
+  while (digits < MOST_DIGITS && !numbers.every((value) => isNear(value, digits))) digits += 1;
+  return digits;
+}
+
+export function tickTexts(values) {
+  const maximumSignificantDigits = enoughDigits(values);
+  const form = new Intl.NumberFormat("en", { notation: "compact", maximumSignificantDigits });
+  return values.map((value) => (isNumber(value) ? form.format(value) : NONE));
+}
 
 // With one decimal; returns of 0 to 1 are told apart by their second and third. With as many as what it is read beside.
 export function returnText(value, ...beside) {
@@ -41,9 +61,11 @@ export function significant(value, digits = 4) {
 
 // A hyperparameter's value: 64x64 for lists, 16x8x4 32x4x2 for lists in a list.
 export function settingText(value, digits = 4) {
-  if (value === null || value === undefined) return NONE;
+  if (value === undefined) return NONE;
+  if (value === null) return NOT_SET;
   if (Array.isArray(value)) {
-    return value.map((item) => settingText(item, digits)).join(value.some(Array.isArray) ? " " : "x");
+    const texts = value.map((item) => (item === null ? NONE : settingText(item, digits)));
+    return texts.join(value.some(Array.isArray) ? " " : "x");
   }
   if (typeof value === "number") return significant(value, digits);
   return typeof value === "object" ? JSON.stringify(value) : String(value);

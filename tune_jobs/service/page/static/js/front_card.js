@@ -1,4 +1,5 @@
 // Score against cost: the settings on their Pareto front, of a sweep that asks for it, as trials end.
+import { Again } from "./again.js";
 import { el, setAttribute, setText } from "./dom.js";
 import { Ended } from "./ended.js";
 import { FrontChart } from "./front_chart.js";
@@ -15,6 +16,9 @@ export class FrontCard {
     this.ended = new Ended();
     this.isAsking = false;
     this.view = null;
+    this.data = null;
+    this.generation = 0;
+    this.again = new Again(() => this.follow(this.data));
     this.near = el("p", {});
     this.missing = el("p", { class: "missing quiet" }, TOO_FEW);
     this.drawn = el("div", { class: "front-drawn" }, el("p", { class: "quiet small" }, DRAWN));
@@ -32,19 +36,41 @@ export class FrontCard {
     this.chart = null;
   }
 
-  // Asked for again as trials end, and shown with the trials that there are now.
+  // Asked for again as trials end, and where it did not come; shown with the trials that there are now.
   async follow(data) {
+    this.data = data;
     this.card.hidden = !data.spec?.objective?.cost;
-    if (this.card.hidden || this.isAsking || !this.ended.isDue(data.summary)) return;
+    if (this.card.hidden || this.isAsking || this.again.isWaiting || !this.ended.isDue(data.summary)) return;
     this.isAsking = true;
+    const { generation } = this;
     try {
-      this.show(await this.source.front(), data);
+      const view = await this.source.front();
+      this.again.reset();
+      if (generation === this.generation) this.show(view, data);
     } catch (error) {
-      // Asked for again with the next trials: what can't be made now may not be so in a second.
-      if (this.view === null) setText(this.missing, error.message);
+      if (generation === this.generation) this.refuse(error);
     } finally {
       this.isAsking = false;
     }
+    // Meanwhile the sweep has become another one, of which nothing is asked yet.
+    if (generation !== this.generation) this.follow(this.data);
+  }
+
+  refuse(error) {
+    // Asked for again with the next trials: what can't be made now may not be so in a second.
+    if (this.view === null) setText(this.missing, error.message);
+    if (!this.source.isFile && this.again.failed(error)) this.ended.forget();
+  }
+
+  // The sweep is another one of the same name: what is shown is not its.
+  forget() {
+    this.generation += 1;
+    this.view = null;
+    this.again.reset();
+    this.ended.forget();
+    this.missing.hidden = false;
+    this.parts.hidden = this.near.hidden = this.about.hidden = true;
+    setText(this.missing, TOO_FEW);
   }
 
   show(view, data) {
@@ -121,6 +147,7 @@ export class FrontCard {
 
   close() {
     this.isClosed = true;
+    this.again.close();
     this.chart?.close();
   }
 }

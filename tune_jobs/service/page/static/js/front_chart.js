@@ -1,7 +1,7 @@
 // A dot for each setting, by its cost and its score, and the front as steps.
 import { paintDot } from "./chart.js";
 import { colour, el, setText } from "./dom.js";
-import { compact, count, counted, pointText, returnText } from "./format.js";
+import { count, counted, pointText, returnText, tickTexts } from "./format.js";
 import { drawLine } from "./lines.js";
 import { Plot, withAir } from "./plot.js";
 
@@ -44,7 +44,7 @@ export class FrontChart {
       axes: [
         {
           splits: (_u, _axis, low, high, increment) => (this.isLog ? decades(low, high, increment) : steps(low, high, increment)),
-          values: (_u, values) => values.map((value) => compact(this.isLog ? 10 ** value : value)),
+          values: (_u, values) => tickTexts(values.map((value) => (this.isLog ? 10 ** value : value))),
         },
       ],
     });

@@ -1,4 +1,5 @@
 // Which hyperparameters the scores depend on, as it firms up.
+import { Again } from "./again.js";
 import { el, reconcile, setAttribute, setText } from "./dom.js";
 import { Ended } from "./ended.js";
 
@@ -10,24 +11,51 @@ export class ImportanceCard {
     Object.assign(this, { card, source });
     this.ended = new Ended();
     this.isAsking = false;
+    this.sweep = null;
+    this.generation = 0;
+    this.again = new Again(() => this.follow(this.sweep));
     this.caption = el("p", { class: "quiet small" });
     this.rows = el("ul", { class: "shares" });
     this.notes = el("div", { class: "quiet small" });
     card.append(el("div", { class: "card-head" }, el("h2", {}, "What mattered")), this.caption, this.rows, this.notes);
   }
 
-  // It is asked for again as trials end.
+  // It is asked for again as trials end, and where it did not come.
   async follow(sweep) {
+    this.sweep = sweep;
     setText(this.caption, this.caption.textContent || "Said once some trials have ended.");
-    if (this.isAsking || !this.ended.isDue(sweep)) return;
+    if (this.isAsking || this.again.isWaiting || !this.ended.isDue(sweep)) return;
     this.isAsking = true;
+    const { generation } = this;
     try {
-      this.show(await this.source.importance());
+      const found = await this.source.importance();
+      this.again.reset();
+      if (generation === this.generation) this.show(found);
     } catch (error) {
-      setText(this.caption, error.message);
+      if (generation === this.generation) this.refuse(error);
     } finally {
       this.isAsking = false;
     }
+    // Meanwhile the sweep has become another one, of which nothing is asked yet.
+    if (generation !== this.generation) this.follow(this.sweep);
+  }
+
+  refuse(error) {
+    // The shares of before stay, with what they are.
+    if (!this.rows.children.length) setText(this.caption, error.message);
+    if (!this.source.isFile && this.again.failed(error)) this.ended.forget();
+  }
+
+  // The sweep is another one of the same name: what is shown is not its.
+  forget() {
+    this.generation += 1;
+    this.again.reset();
+    this.ended.forget();
+    this.show({ hyperparams: [], too_few: "", interactions: [], edges: [], notes: [] });
+  }
+
+  close() {
+    this.again.close();
   }
 
   show({ hyperparams, too_few: tooFew, interactions, edges, notes }) {

@@ -1,8 +1,9 @@
 // A new sweep: the sweep file in an editor, what is wrong with it, what would run, and what else there is to say of it.
 import { tagsOf } from "./actions.js";
-import { ask, randomKey, Refused } from "./api.js";
+import { Again, mayPass } from "./again.js";
+import { ask, randomKey, Unreachable } from "./api.js";
 import { Completion } from "./completion.js";
-import { askInDialog, refusal } from "./dialogs.js";
+import { askInDialog, awaited, GOES_ON, refusal } from "./dialogs.js";
 import { el, setText, toast } from "./dom.js";
 import { Editor } from "./editor.js";
 import { PlanCard } from "./plan_card.js";
@@ -11,7 +12,7 @@ import { maySubmit, me } from "./who.js";
 import { lineOfPath } from "./yaml_lines.js";
 
 const PAUSE_MS = 400;
-// When it is asked again after the service had no turn for it.
+// When it is asked again after the service had no turn for it, or was away.
 const AGAIN_MS = 10_000;
 const DRAFT = "tune-jobs draft";
 const FIRST =
@@ -121,10 +122,11 @@ export function openNew(main, route) {
       plan.show(found);
     } catch (error) {
       if (error.name === "AbortError" || isClosed) return;
-      const problems = problemsOf(error, text);
+      // It is no submission: what was away is asked again.
+      const problems = problemsOf(error instanceof Unreachable ? new Unreachable() : error, text);
       editor.mark(new Map(problems.filter((item) => item.line !== null).map((item) => [item.line, item.text])));
-      plan.refuse(problems, error instanceof Refused ? "" : error.hint);
-      if (error.status === 429) later(AGAIN_MS);
+      plan.refuse(problems, error.status >= 500 ? GOES_ON : "");
+      if (mayPass(error)) later(AGAIN_MS);
     }
   }
 
@@ -203,26 +205,41 @@ export function openNew(main, route) {
   });
   submit.disabled = !maySubmit();
 
+  // Before anything else may fail: who goes on writing goes on from it.
+  editor.text = sessionStorage.getItem(DRAFT) ?? "";
+  const again = new Again(begin);
+
   async function begin() {
-    const [schema, found] = await Promise.all([ask("schema"), ask("presets")]);
+    let found, schema;
+    try {
+      [schema, found] = await Promise.all([ask("schema"), ask("presets")]);
+    } catch (error) {
+      if (isClosed) return;
+      problem.replaceChildren(...awaited(error));
+      again.failed(error);
+      return;
+    }
     if (isClosed) return;
+    if (again.failures) problem.replaceChildren();
+    again.reset();
     presets = found;
     editor.completion = new Completion(schema);
     choice.append(...found.map((item) => el("option", { value: item.name }, `${item.name}: ${item.title}`)));
     const wanted = route.params.preset ?? "";
     choice.value = wanted;
     if (wanted && choice.value !== wanted) choice.value = "";
-    const draft = sessionStorage.getItem(DRAFT);
-    editor.text = draft ?? textOf(choice.value);
+    // What was written meanwhile is the draft.
+    editor.text = sessionStorage.getItem(DRAFT) ?? textOf(choice.value);
     describe(choice.value);
     check();
   }
-  begin().catch((error) => problem.replaceChildren(...refusal(error)));
+  begin();
 
   return {
     close() {
       isClosed = true;
       clearTimeout(timer);
+      again.close();
       asked?.abort();
     },
   };

@@ -191,9 +191,9 @@ export class Parallel {
     for (const trial of trials) {
       let last = null;
       this.axes.forEach((axis, index) => {
-        const value = axis.valueOf(trial);
-        if (value === null) return;
-        const [left, top] = [axis.left, topOf(axis.place(value))];
+        const at = axis.place(axis.valueOf(trial));
+        if (at === undefined) return;
+        const [left, top] = [axis.left, topOf(at)];
         if (last !== null && index - last.index > 1 === isOverGaps) {
           if (isOverGaps) context.moveTo(last.left, last.top);
           context.lineTo(left, top);
@@ -288,9 +288,9 @@ export class Parallel {
     let least = NEAR_PX;
     for (const trial of this.trials) {
       if (!this.matching.has(trial.trial_id)) continue;
-      const [a, b] = [one.valueOf(trial), two.valueOf(trial)];
-      if (a === null || b === null) continue;
-      const distance = Math.abs(topOf(one.place(a)) * (1 - share) + topOf(two.place(b)) * share - top);
+      const [a, b] = [one, two].map((axis) => axis.place(axis.valueOf(trial)));
+      if (a === undefined || b === undefined) continue;
+      const distance = Math.abs(topOf(a) * (1 - share) + topOf(b) * share - top);
       if (distance < least) [least, found] = [distance, trial.trial_id];
     }
     return found;

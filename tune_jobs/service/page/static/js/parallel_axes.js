@@ -1,5 +1,6 @@
 // The axes of parallel coordinates: where a value lies on its axis (0 below, 1 at the top), and which values a range has.
-import { returnText, settingText } from "./format.js";
+// A value that has no place on it, as it does not act in a trial, has `undefined` for one.
+import { enoughDigits, returnText, settingText } from "./format.js";
 import { shownPoint } from "./shown_point.js";
 
 const NUM_TICKS = 4;
@@ -8,7 +9,7 @@ export function axesOf(searchedOnes, trials) {
   const axes = searchedOnes.map((searched) =>
     axisOf(
       searched,
-      trials.map((trial) => shownPoint(trial)[searched.name]).filter((value) => value !== undefined && value !== null),
+      trials.map((trial) => valueIn(trial, searched.name)).filter((value) => value !== undefined),
     ),
   );
   const scores = trials.map((trial) => trial.score).filter((score) => score !== null);
@@ -19,12 +20,19 @@ export function axesOf(searchedOnes, trials) {
       valueOf: (trial) => trial.score,
       text: returnText,
     });
-  return axes.map((axis) => ({ valueOf: (trial) => shownPoint(trial)[axis.name] ?? null, ...axis }));
+  return axes.map((axis) => ({ valueOf: (trial) => valueIn(trial, axis.name), ...axis }));
 }
 
-function axisOf({ name, kind, values }, found) {
+// undefined: it does not act. null is a value like others, as that of a gradient that is not clipped.
+function valueIn(trial, name) {
+  const point = shownPoint(trial);
+  return Object.hasOwn(point, name) ? point[name] : undefined;
+}
+
+function axisOf({ name, kind, values }, given) {
+  const found = given.filter((value) => value !== null);
   const isNumeric = found.length > 0 && found.every((value) => typeof value === "number");
-  if (kind === "listed" || !isNumeric) return listedAxis(name, [...values, ...found]);
+  if (kind === "listed" || !isNumeric) return listedAxis(name, [...values, ...given]);
   if (kind === "near one" && found.every((value) => value < 1)) return rangeAxis(name, kind, found);
   return rangeAxis(name, kind === "log" && found.every((value) => value > 0) ? "log" : "linear", found);
 }
@@ -34,7 +42,7 @@ function listedAxis(name, values) {
   const isNumeric = values.every((value) => typeof value === "number");
   if (isNumeric) texts.sort((a, b) => Number(a) - Number(b));
   const places = new Map(texts.map((text, index) => [text, texts.length === 1 ? 0.5 : index / (texts.length - 1)]));
-  const place = (value) => places.get(settingText(value));
+  const place = (value) => (value === undefined ? undefined : places.get(settingText(value)));
   return {
     name,
     kind: "listed",
@@ -62,7 +70,9 @@ function rangeAxis(name, kind, values) {
   let [low, high] = values.reduce(([a, b], value) => [Math.min(a, value), Math.max(b, value)], [Infinity, -Infinity]);
   const { by, back, ticks, around } = SCALES[kind];
   if (low === high) [low, high] = around(low);
-  const place = (value) => (by(value) - by(low)) / (by(high) - by(low));
+  const place = (value) => (typeof value === "number" ? (by(value) - by(low)) / (by(high) - by(low)) : undefined);
+  const marks = ticks(low, high);
+  const digits = enoughDigits(marks);
   const valueAt = (at) => back(by(low) + at * (by(high) - by(low)));
   return {
     name,
@@ -70,10 +80,7 @@ function rangeAxis(name, kind, values) {
     place,
     valueAt,
     text: (value) => settingText(value, 3),
-    ticks: ticks(low, high).map((value) => ({
-      text: settingText(value, 3),
-      at: place(value),
-    })),
+    ticks: marks.map((value) => ({ text: settingText(value, digits), at: place(value) })),
     // An end of the axis is the value of a trial, which rounding would leave out.
     rangeText: (from, to) =>
       `${from <= 0 ? low : rounded(valueAt(from))}..${to >= 1 ? high : rounded(valueAt(to))}`,

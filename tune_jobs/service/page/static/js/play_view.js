@@ -1,6 +1,7 @@
 // Watch a policy play, and another one beside it. The address says which ones, the seed and the speed.
+import { Again } from "./again.js";
 import { ask, ofSweep } from "./api.js";
-import { refusal } from "./dialogs.js";
+import { awaited } from "./dialogs.js";
 import { el, setText } from "./dom.js";
 import { Player } from "./player.js";
 import { policiesOf, policyOf, settled, textOf, usual } from "./play_policies.js";
@@ -216,17 +217,22 @@ export function openPlay(main, route) {
   addEventListener("pagehide", halt);
   addEventListener("pageshow", shown);
 
+  const waiting = new Again(load);
+
   async function load() {
     let summary;
     try {
       [summary, known] = await Promise.all([ask(ofSweep(name)), policiesOf(name, policies())]);
     } catch (error) {
-      if (!isClosed) problem.replaceChildren(el("div", { class: "notice bad" }, ...refusal(error)));
+      if (isClosed) return;
+      problem.replaceChildren(el("div", { class: "notice bad" }, ...awaited(error)));
+      waiting.failed(error);
       return;
     } finally {
       loading.hidden = true;
     }
     if (isClosed) return;
+    problem.replaceChildren();
     what.append(` · ${summary.env} · ${summary.algorithm}`);
     begin();
   }
@@ -248,6 +254,7 @@ export function openPlay(main, route) {
     },
     close() {
       isClosed = true;
+      waiting.close();
       clearTimers();
       document.removeEventListener("visibilitychange", looked);
       removeEventListener("pagehide", halt);

@@ -1,10 +1,13 @@
 // A plot: uPlot has the axes, the grid, the zoom and the cursor; what is in it is drawn by the chart.
 import { colour, el, onThemeChange } from "./dom.js";
-import { compact } from "./format.js";
+import { tickTexts } from "./format.js";
 
 const { uPlot } = window;
 export const FONT_FAMILY = 'system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", "Liberation Sans", sans-serif';
 const FONT = `12px ${FONT_FAMILY}`;
+
+// What has more digits than usual needs more room than usual.
+const roomFor = (texts) => 10 + 7 * Math.max(0, ...texts.map((text) => text.length));
 
 export class Plot {
   // `paint(context, places)` draws; `find(places, left, top)` returns what is near the cursor as { lines, id }, or null;
@@ -48,16 +51,16 @@ export class Plot {
             size: 30,
             gap: 4,
             space: 70,
-            values: (_, values) => values.map(compact),
+            values: (_, values) => tickTexts(values),
             ...axes[0],
           },
           {
             ...axis,
             ...(yLabel ? { label: yLabel, labelSize: 18 } : {}),
-            size: yLabel ? 44 : 52,
+            size: (_, texts) => Math.max(yLabel ? 44 : 52, roomFor(texts ?? [])),
             gap: 6,
             space: 34,
-            values: (_, values) => values.map(compact),
+            values: (_, values) => tickTexts(values),
             ...axes[1],
           },
         ],

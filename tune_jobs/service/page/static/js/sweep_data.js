@@ -32,6 +32,8 @@ export class SweepData {
     this.source = source;
     this.summary = null;
     this.spec = null;
+    // When the sweep was made that the spec is of: another one may come under its name.
+    this.specOf = null;
     this.trials = [];
     // By trial, in columns: env steps, training returns, evaluation returns, and the iterations that they are of.
     this.curves = new Map();
@@ -44,9 +46,12 @@ export class SweepData {
   async load(onPart = () => {}) {
     const { source } = this;
     const curves = await source.curves();
-    const [summary, spec] = await Promise.all([source.summary(), this.spec ?? source.spec()]);
+    const [summary, known] = await Promise.all([source.summary(), this.spec ?? source.spec()]);
     const isFirst = this.summary === null;
-    Object.assign(this, { summary, spec, curves: new Map(Object.entries(curves.trials)) });
+    const isOther = this.spec !== null && summary.created_at !== this.specOf;
+    const spec = isOther ? await source.spec() : known;
+    const specOf = summary.created_at;
+    Object.assign(this, { summary, spec, specOf, curves: new Map(Object.entries(curves.trials)) });
     const trials = await source.trials(FIELDS, (some) => {
       // Later on there is more to be seen than a part.
       if (!isFirst || this.trials.length) return;

@@ -45,6 +45,8 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
   let shown = [];
   let isClosed = false;
   let frame = 0;
+  let isGone = false;
+  let madeAt = null;
 
   const alert = makeAlert();
   const actions = source.isFile
@@ -162,7 +164,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
       const axis = data.axes.find((known) => known.name === name);
       if (!axis) return [];
       const test = axis.test(text);
-      return [(trial) => axis.valueOf(trial) !== null && test(axis.valueOf(trial))];
+      return [(trial) => axis.place(axis.valueOf(trial)) !== undefined && test(axis.valueOf(trial))];
     });
     const wanted = filterOf(seen.filter, columns);
     return data.trials.filter((trial) => wanted(trial) && tests.every((test) => test(trial)));
@@ -225,25 +227,36 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
 
   const followed = source.follow({
     kinds: ["status", "trials", "iterations", "deleted"],
-    load: () => data.load(() => showAll()),
+    load,
     apply(kind, changes) {
-      if (kind === "deleted")
-        alert.show({ message: `Sweep ${source.name} was deleted.`, hint: "What is shown is how it was." });
-      else data.apply(kind, changes);
+      if (kind !== "deleted") return data.apply(kind, changes);
+      isGone = true;
+      return alert.show({ message: `Sweep ${source.name} was deleted.`, hint: "What is shown is how it was." });
     },
     show(error) {
       if (error === null) return showAll();
-      const isGone = error.status === 404;
+      const isMissing = error.status === 404;
+      isGone ||= isMissing;
       if (page.hidden) {
         const back = el("p", {}, el("a", { href: "#/" }, "To all sweeps"));
-        setAttribute(loading, "class", isGone ? "empty quiet" : null);
-        loading.replaceChildren(...(isGone ? [...refusal(error), back] : [el("h1", {}, source.name), notYet(error)]));
-      } else if (isGone) alert.show(error);
+        setAttribute(loading, "class", isMissing ? "empty quiet" : null);
+        loading.replaceChildren(...(isMissing ? [...refusal(error), back] : [el("h1", {}, source.name), notYet(error)]));
+      } else if (isMissing) alert.show(error);
       return undefined;
     },
   });
 
+  async function load() {
+    const curves = await data.load(() => showAll());
+    // It is there again, or another one of its name is.
+    if (isGone) alert.hide();
+    isGone = false;
+    return curves;
+  }
+
   async function showAll() {
+    if (madeAt !== null && data.specOf !== madeAt) for (const card of [importance, front]) card.forget();
+    madeAt = data.specOf;
     // What a finished sweep came to stands above the rest, which would jump if it came later.
     const told = finished.follow(data.summary);
     if (page.hidden) await told;
@@ -269,7 +282,7 @@ export function openSweep(main, route, source = new ServerSource(route.name)) {
       isClosed = true;
       followed.close();
       removeEventListener("keydown", shortcut);
-      for (const part of [actions, curves, best, front, parallel, timeline, table, panel]) part.close();
+      for (const part of [actions, finished, curves, best, front, parallel, importance, timeline, table, panel]) part.close();
     },
   };
 }

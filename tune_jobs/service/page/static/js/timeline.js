@@ -7,7 +7,11 @@ import { layOut } from "./timeline_layout.js";
 
 const COLOURS = { completed: "series-2", stopped: "series-1", failed: "accent", running: "series-4" };
 const LEGEND = ["running", "completed", "stopped", "failed", "paused"];
-const INCREMENTS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
+const DAY_S = 86_400;
+const DAYS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+const WITHIN_A_DAY = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800];
+// The distances of ticks: where none of them is wide enough, there is no axis.
+const INCREMENTS = [...WITHIN_A_DAY, ...DAYS.map((days) => days * DAY_S)];
 const MOST_PX = 440;
 const FIXED_PX = 70;
 const ROW_PX = 18;

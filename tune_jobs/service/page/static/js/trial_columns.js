@@ -14,6 +14,8 @@ export function columnsOf(searched, hasSeveralSeeds) {
       label: name,
       isNumber,
       value: (row) => plain(shownPoint(row)[name]),
+      // Not the same as that it does not act.
+      isUnset: (row) => Object.hasOwn(shownPoint(row), name) && shownPoint(row)[name] === null,
       text: (row) => valueText(shownPoint(row), name),
     })),
     column("training_return", "training return", (row) => row.training_return, returnText, true),
