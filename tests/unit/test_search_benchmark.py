@@ -213,6 +213,16 @@ def test_ranks_leave_out_a_task_that_a_method_has_run_less_often() -> None:
     ]
 
 
+def test_a_method_with_few_runs_of_a_task_takes_that_from_no_others() -> None:
+    whole, few = kept(1, 2), kept(3)
+    found = {(task, name): whole for task in ("cartpole-dqn", "acrobot-dqn") for name in ("random", "tpe", "pbt")}
+    found |= {("cartpole-dqn", "asha"): whole, ("acrobot-dqn", "asha"): few}
+    lines = list(tables(found))
+    assert [line.partition(",")[0] for line in lines if line.startswith("Mean rank")] == [
+        "Mean rank of 2 over 2 tasks", "Mean rank of 3 over 2 tasks", "Mean rank of 4 over 1 task",
+    ]  # fmt: skip
+
+
 def test_the_default_is_ranked_beside_random_draws_wherever_both_were_run() -> None:
     found = {("cartpole-dqn", "random"): kept(1, 2), ("cartpole-dqn", "gp"): kept(5, 1)}
     text = "\n".join(tables({**found, ("acrobot-dqn", "gp"): kept(5, 5), ("acrobot-dqn", "tpe"): kept(5, 5)}))

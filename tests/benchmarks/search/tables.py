@@ -34,16 +34,22 @@ def tables(kept: Kept) -> Iterator[str]:
     yield ""
     yield from _table(kept, tasks, [*methods, *confirmed], "test", published=False)
     yield ""
-    # The more methods, the fewer tasks that all of them have run.
-    everywhere = [method for method in methods if all(kept.get((task, method)) for task in tasks)]
+    # The more methods, the fewer tasks that all of them have run as often as any.
+    often = [_most_often(kept, task, methods) for task in tasks]
     choosing = [method for method in methods if method in METHODS]
     default = [method for method in methods if method in ("random", AUTO_SEARCH)]
-    for some in dict.fromkeys(map(tuple, (default, everywhere, choosing, methods))):
+    for some in dict.fromkeys(map(tuple, (default, choosing, *sorted(often, key=len), methods))):
         yield from _ranks(kept, tasks, some)
     for named in dict.fromkeys(((*default, *confirmed), (*methods, *confirmed)) if confirmed else ()):
         yield from _ranks(kept, tasks, named, {"test": "on test seeds"})
     yield ""
     yield from _made(kept, tasks, everything)
+
+
+def _most_often(kept: Kept, task: str, methods: Sequence[str]) -> tuple[str, ...]:
+    """Return the methods that have run a task as often as any."""
+    num_runs = {method: len(found["runs"]) for method in methods if (found := kept.get((task, method))) is not None}
+    return tuple(method for method, number in num_runs.items() if number == max(num_runs.values()))
 
 
 def values_of(found: dict[str, Any], what: str) -> list[float]:
