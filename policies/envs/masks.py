@@ -121,7 +121,7 @@ class MaskedBox(gym.spaces.Box):
                 raise ValueError("there is no mask")
             rows = numbers_of(observations, self)
             check_masks(rows[..., : self.num_masked], self.sizes)
-            numbers_of(rows[..., self.num_masked :], self.seen)
+            numbers_of(rows[..., self.num_masked :], self.seen)  # refuses what are no bytes, of an image of these
             return rows
         vectors = self._unmasked(observations)
         if vectors.ndim == 1:

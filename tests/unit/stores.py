@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+import pytest
 from s3_server import s3_endpoint
 
 from policies.errors import TuneJobsError
@@ -180,6 +181,12 @@ class ObjectHarness:
 
     def shown(self, key: str) -> str:
         return _shown(key)
+
+
+@pytest.fixture(name="harness")
+def object_harness(tmp_path: Path) -> ObjectHarness:
+    """In the place of the one that is each kind of store, for tests of objects alone."""
+    return ObjectHarness(tmp_path)
 
 
 class RunningHarness(ObjectHarness):

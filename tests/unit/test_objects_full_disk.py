@@ -11,7 +11,7 @@ from typing import IO, Any, NoReturn
 import pytest
 from fake_sweeps import RunCommand
 from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
-from stores import ObjectHarness
+from stores import ObjectHarness, object_harness  # noqa: F401 (a fixture)
 
 from policies import files
 from policies.errors import CannotRunError
@@ -21,11 +21,6 @@ from tune_jobs.store.objects import object_trial, parts, scratch
 FULL = os.strerror(errno.ENOSPC)
 OPEN = Path.open
 Prepare = Callable[[Sweep, ObjectHarness], Callable[[], object]]
-
-
-@pytest.fixture
-def harness(tmp_path: Path) -> ObjectHarness:
-    return ObjectHarness(tmp_path)
 
 
 @pytest.fixture

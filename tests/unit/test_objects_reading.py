@@ -1,21 +1,15 @@
 """Reading much of a sweep in an object store: fetched at once, asked for once, and anew the next time."""
 
-from pathlib import Path
 
 import pytest
 from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
-from stores import ObjectHarness
+from stores import ObjectHarness, object_harness  # noqa: F401 (a fixture)
 
 from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.objects.bucket import Bucket, Found
 
 NUM_TRIALS = 3
-
-
-@pytest.fixture
-def harness(tmp_path: Path) -> ObjectHarness:
-    return ObjectHarness(tmp_path)
 
 
 @pytest.fixture

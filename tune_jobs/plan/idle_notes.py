@@ -176,16 +176,12 @@ def _why_it_never_acts(points: _Points, name: str, own: Sequence[Any], *, is_sea
     why = _rules_that_hold(points, name, own, rules, others=others)
     if any(rule.divides for rule in why):
         divided = [read for read in ("num_envs", _DIVIDED_BY_NUM_ENVS[spec.algorithm]) if read in others]
-        steps = {read: _every_step(domain) for read in divided if isinstance(domain := related[read], Range)}
-        why = _rules_that_hold(points, name, own, rules, others={**others, **steps})
+        steps = {read: related[read].all_values(_MOST_COMBINATIONS) for read in divided}
+        whole = {read: values for read, values in steps.items() if values is not None}
+        # Of too many steps, it is not known that none lets it act.
+        why = _rules_that_hold(points, name, own, rules, others=others | whole) if whole == steps else {}
     # Without a reason there were no values with which it acts.
     return "; or ".join(why.values()) or None
-
-
-def _every_step(domain: Range) -> list[Any]:
-    """Return all values of a range of steps, or more than are checked if it has more."""
-    first, last = map(int, domain.codes)
-    return [domain.of_code(code) for code in range(first, min(last, first + _MOST_COMBINATIONS) + 1)]
 
 
 def _rules_that_hold(
