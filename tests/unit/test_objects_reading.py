@@ -1,6 +1,5 @@
 """Reading much of a sweep in an object store: fetched at once, asked for once, and anew the next time."""
 
-
 import pytest
 from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
 from stores import ObjectHarness, object_harness  # noqa: F401 (a fixture)
