@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,16 +72,21 @@ def domains() -> str:
 
 
 def commands() -> str:
-    """What `--help` prints of each command."""
-    return "\n\n".join(_help(name, command) for name, command in cli.commands.items())
+    """What `--help` prints of `tune-jobs` itself, and of each command."""
+    return "\n\n".join(_help(words, command) for words, command in _commands("tune-jobs", cli))
 
 
-def _help(name: str, command: click.Command) -> str:
+def _commands(words: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
+    """A command by the words that it is typed as, and those within it."""
+    yield words, command
+    for name, inner in command.commands.items() if isinstance(command, click.Group) else ():
+        yield from _commands(f"{words} {name}", inner)
+
+
+def _help(words: str, command: click.Command) -> str:
     # The terminal's width is no business of a page.
-    with click.Context(command, info_name=f"tune-jobs {name}", terminal_width=100) as context:
-        parts = [f"### {name}\n\n```text\n{command.get_help(context)}\n```"]
-    inner = command.commands.items() if isinstance(command, click.Group) else ()
-    return "\n\n".join([*parts, *(_help(f"{name} {each}", one) for each, one in inner)])
+    with click.Context(command, info_name=words, terminal_width=100) as context:
+        return f"### {words.removeprefix('tune-jobs ')}\n\n```text\n{command.get_help(context)}\n```"
 
 
 def presets() -> str:

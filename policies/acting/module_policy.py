@@ -16,6 +16,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from policies.acting.policy import WeightsPolicy
 from policies.envs.own_actions import Choices
 from policies.errors import CheckpointError
+from policies.networks.own_modules import check_stateless
 from policies.networks.rl_modules import import_module_class
 from policies.portable.file import ModuleWeights, PortablePolicy
 
@@ -30,7 +31,7 @@ class ModulePolicy(WeightsPolicy):
         description: Shown in captions; by default the algorithm and the env.
 
     Raises:
-        SpecError: The class's module is not allowed, or the class cannot be imported.
+        SpecError: The class's module is not allowed, the class cannot be imported, or it is recurrent.
         CheckpointError: The saved weights are not those of the class.
     """
 
@@ -53,6 +54,7 @@ class ModulePolicy(WeightsPolicy):
             # As in training, where RLlib gives a module its algorithm's catalog.
             catalog_class=PPOCatalog if self.portable.algorithm == "ppo" else DQNCatalog,
         ).build()
+        check_stateless(module)
         # torch takes writable arrays only, and those of safetensors are not.
         state = {name: torch.from_numpy(np.array(tensor)) for name, tensor in saved.tensors.items()}
         try:

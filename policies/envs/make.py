@@ -38,6 +38,7 @@ from policies.envs.rendering import choose_before_import, draw_without_display, 
 from policies.envs.signatures import named_parameters, takes_any_name
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
+from policies.envs.time_limits import checked_time_limit
 from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
@@ -82,7 +83,7 @@ class EnvInfo:
     max_episode_steps: int | None
     """Env steps after which an episode is truncated; None if it never is."""
     has_vector_entry_point: bool
-    """Whether `make_vector_env` uses the env's own vectorised version."""
+    """Whether `make_vector_env` uses the env's own vectorised version, unless this, once made, resets otherwise."""
     failure: FailureRule | None = None
     """The rule by which its episodes end by failure; None if they never do, or it is not known."""
     mask: str | None = None
@@ -133,7 +134,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             observation_space=env.observation_space,
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
-            max_episode_steps=None if env.spec is None else env.spec.max_episode_steps,
+            max_episode_steps=checked_time_limit(env, env_id, kwargs.get(_LIMIT)),
             has_vector_entry_point=not is_changed
             and _may_be_vectorised(env_id, spec, wrappers)
             and takes_vector_entry_point(spec, kwargs),

@@ -42,6 +42,27 @@ def check_own_module(rl_module: str, found: type, algorithm: str, asked: Mapping
         _check_reached(rl_module, found, asked)
 
 
+def check_stateless(module: Any) -> None:
+    """Check that a module which is built needs nothing of the step before but what is in the observation.
+
+    Only the module itself knows, not its class: many classes have the method that gives a state, and give none.
+
+    Args:
+        module: An RLModule.
+
+    Raises:
+        SpecError: It is recurrent.
+    """
+    if module.is_stateful():
+        named = f"{type(module).__module__}:{type(module).__qualname__}"
+        raise SpecError(
+            f"rl_module {named!r} is recurrent: its get_initial_state() gives a state, but no state is carried from "
+            "one step to the next.",
+            "Let get_initial_state() return {}, and give the network earlier observations by env.frame_stack, or by a "
+            "wrapper of your own.",
+        )
+
+
 def _check_reached(rl_module: str, found: type, asked: Mapping[str, Sequence[Any]]) -> None:
     for name, (own, why) in _RLLIBS.items():
         others = [value for value in asked.get(name, ()) if value != own]

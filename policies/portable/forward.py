@@ -73,7 +73,7 @@ class ForwardPass:
         images = images.transpose(0, 3, 1, 2)  # channels first, as torch flattens images
         if image is None:
             return images
-        flat = images.reshape(len(images), -1)
+        flat = images.reshape(len(images), math.prod(images.shape[1:]))  # NumPy finds no -1 for a batch of none
         return np.concatenate([flat, *image.beside_of(x)], axis=1)
 
 

@@ -31,11 +31,12 @@ from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY,
 from policies.envs.modules import allow_modules
 from policies.envs.spaces import observation_dtype
 from policies.envs.training_view import TrainingView
+from policies.networks.own_modules import check_stateless
 from policies.parents import end_with_parent
 from policies.replay import NStep, Transitions
 from policies.rllib.ruined import check_outputs
 from policies.rllib.runner_errors import TellsErrors
-from policies.rllib.streams import OWN_ENDS, OWN_REWARDS, Stream, own_ends_of, own_rewards_of
+from policies.rllib.streams import OWN_ENDS, OWN_REWARDS, Part, Stream, own_ends_of, own_rewards_of
 
 _WEIGHTS_SEQ_NO = "weights_seq_no"
 _REWARDS_SPACE = gym.spaces.Box(float("-inf"), float("inf"), (), np.float32)
@@ -126,6 +127,11 @@ class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
         self._to_bounds = ToBounds(space) if isinstance(space, gym.spaces.Box) else None
         self._needs_initial_reset = True
 
+    def make_module(self) -> None:
+        """Build the module; see `check_stateless`."""
+        super().make_module()
+        check_stateless(self.module)
+
     def _reset_arrays(self) -> None:
         """Reset every sub-environment; seeded the first time only, as RLlib does.
 
@@ -164,11 +170,14 @@ class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
             return episodes
         if force_reset or self._needs_initial_reset or self._obs is None:
             self._reset_arrays()
-        fragment = self._collect(num_timesteps, explore=explore)
+        # The count is that of all env runners, in whole rounds of them, as RLlib has it.
+        num_runners = self.config.num_env_runners or 1
+        before = self.num_env_steps_sampled_lifetime // num_runners * num_runners
+        fragment = self._collect(num_timesteps, explore=explore, num_env_steps=before)
         done, ongoing = self._cut(fragment)
         self._done_episodes_for_metrics.extend(done)
         for episode in ongoing:
-            self._ongoing_episodes_for_metrics[episode.id_].append(episode)
+            self._ongoing_episodes_for_metrics[episode.id_].append(Part(episode))
         num_steps = int(fragment["stepped"].sum())
         self._log_env_steps(metric=self._metrics_num_env_steps_sampled, num_steps=num_steps)
         self._increase_sampled_metrics(num_steps, len(done))
@@ -342,7 +351,7 @@ class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
             if start < length:
                 chunk = self._chunk(fragment, stream, index, start, length)
                 ongoing.append(chunk)
-                self._keep_tail(stream, chunk)
+                stream.keep_tail(chunk, int(self.config.episode_lookback_horizon))
         done.sort(key=lambda item: item[:2])
         self.finished_episodes.extend(whole for *_, whole in done if whole is not None)
         return [chunk for _, _, chunk, _ in done], ongoing
@@ -382,14 +391,3 @@ class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
         stream.num_learner_steps += num_steps
         stream.episode_return += float(own_rewards_of(fragment)[start:stop, index].sum(dtype=np.float64))
         return episode
-
-    def _keep_tail(self, stream: Stream, chunk: SingleAgentEpisode) -> None:
-        horizon = int(self.config.episode_lookback_horizon)
-        if horizon == 0:
-            return
-        stream.tail = {
-            "obs": chunk.observations.data[-horizon - 1 : -1],
-            Columns.ACTIONS: chunk.actions.data[-horizon:],
-            "rewards": chunk.rewards.data[-horizon:],
-            **{key: buffer.data[-horizon:] for key, buffer in chunk.extra_model_outputs.items()},
-        }

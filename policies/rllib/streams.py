@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from ray.rllib.core.columns import Columns
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
 OWN_REWARDS = "own_rewards"
 OWN_ENDS = "own_ends"
@@ -37,6 +39,41 @@ class Stream:
         self.num_learner_steps = 0
         # The last rows of the previous chunk, for RLlib's lookback buffers: column -> (lookback, ...).
         self.tail: dict[str, NDArray[Any]] = {}
+
+    def keep_tail(self, chunk: SingleAgentEpisode, horizon: int) -> None:
+        """Keep the last steps of a chunk, so many as the next one looks back."""
+        if horizon == 0:
+            return
+        self.tail = {
+            "obs": chunk.observations.data[-horizon - 1 : -1],
+            Columns.ACTIONS: chunk.actions.data[-horizon:],
+            "rewards": chunk.rewards.data[-horizon:],
+            **{key: buffer.data[-horizon:] for key, buffer in chunk.extra_model_outputs.items()},
+        }
+
+
+class Part:
+    """What RLlib's metrics (2.60) ask of a chunk of an episode that runs on, in its place.
+
+    A chunk has all observations of its steps, which would be kept until the episode ends, however long it is.
+    """
+
+    def __init__(self, chunk: SingleAgentEpisode) -> None:
+        self._length = len(chunk)
+        self._return = chunk.get_return()
+        self._duration_s = chunk.get_duration_s()
+
+    def __len__(self) -> int:
+        """Return the chunk's env steps."""
+        return self._length
+
+    def get_return(self) -> Any:
+        """Return the sum of the chunk's rewards, as RLlib adds them up."""
+        return self._return
+
+    def get_duration_s(self) -> Any:
+        """Return the seconds that the chunk took, as RLlib has them."""
+        return self._duration_s
 
 
 def own_rewards_of(fragment: dict[str, NDArray[Any]]) -> NDArray[Any]:

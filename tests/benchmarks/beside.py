@@ -18,7 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from policies.foreign_code import stable_baselines3_program
+from policies.foreign_code import ForeignProgram, stable_baselines3_program
 from policies.hyperparams import Algorithm, DQNHyperparams, PPOHyperparams, make_hyperparams
 from tests.benchmarks import workload
 from tests.benchmarks.measure import run
@@ -96,6 +96,18 @@ WORKS = {
 }  # fmt: skip
 
 
+def peer_notes(work: Work) -> tuple[str, ...]:
+    """Return what the peer's program leaves out of the settings, or does otherwise."""
+    return peer_program(work, work.lrs[0]).notes
+
+
+def peer_program(work: Work, lr: float) -> ForeignProgram:
+    """Return the program that trains one of its trials with Stable-Baselines3."""
+    hyperparams = make_hyperparams(work.algorithm, {**work.hyperparams, "lr": lr})
+    assert isinstance(hyperparams, PPOHyperparams | DQNHyperparams)
+    return stable_baselines3_program(hyperparams, env_id=work.env_id, env_args={}, num_env_steps=work.num_env_steps)
+
+
 def train(work: Work, lrs: list[float]) -> list[float]:
     """Train trials with Stable-Baselines3, one after the other, and return the seconds in `learn` of each."""
     import torch
@@ -103,13 +115,8 @@ def train(work: Work, lrs: list[float]) -> list[float]:
     torch.set_num_threads(1)
     seconds: list[float] = []
     for lr in lrs:
-        hyperparams = make_hyperparams(work.algorithm, {**work.hyperparams, "lr": lr})
-        assert isinstance(hyperparams, PPOHyperparams | DQNHyperparams)
-        program = stable_baselines3_program(
-            hyperparams, env_id=work.env_id, env_args={}, num_env_steps=work.num_env_steps
-        )
         # The last line trains.
-        making, training = program.code.rsplit("\n", 1)
+        making, training = peer_program(work, lr).code.rsplit("\n", 1)
         names: dict[str, Any] = {}
         exec(making, names)
         start = time.perf_counter()
@@ -155,6 +162,7 @@ def rows(repeats: int) -> list[Row]:
                 f"({min(ratios):.2f} to {max(ratios):.2f})"
             )
             table.append((title, text, bar))
+        table += [("  the peer differs", note, "") for note in peer_notes(work)]
     return table
 
 

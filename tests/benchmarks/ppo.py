@@ -134,7 +134,7 @@ def rows(options: argparse.Namespace) -> list[Row]:
         ("launch, 20 trials, start to end", f"{ours:.1f} s", "15 s"),
         ("  without best, videos, report", f"{median(found['trials']):.1f} s", ""),
         ("  the same, once Ray is up", f"{median(found['up']):.1f} s", "5 s"),
-        ("  peak memory of all its processes", f"{peak / 2**30:.2f} GiB", "4 GiB"),
+        ("  peak memory of all its processes (the most of all runs)", f"{peak / 2**30:.2f} GiB", "4 GiB"),
         ("  first result on the screen", f"{median(first):.1f} s", "10 s"),
         *pack_rows("pack of 20", packs[20], "140,000"),
         *pack_rows("one trial alone in a pack", packs[1], "40,000"),
@@ -159,8 +159,12 @@ def command_rows() -> list[Row]:
         return median([run([CLI, *arguments], cwd=ROOT).wall_s for _ in range(5)])
 
     return [
-        ("tune-jobs --help", f"{seconds('--help'):.2f} s", "0.5 s"),
-        ("tune-jobs launch --dry-run", f"{seconds('launch', 'cartpole-ppo', '--dry-run'):.2f} s", "0.5 s"),
+        ("tune-jobs --help (median of 5)", f"{seconds('--help'):.2f} s", "0.5 s"),
+        (
+            "tune-jobs launch --dry-run (median of 5)",
+            f"{seconds('launch', 'cartpole-ppo', '--dry-run'):.2f} s",
+            "0.5 s",
+        ),
     ]
 
 
@@ -173,9 +177,9 @@ def many_rows(num_env_steps: int) -> list[Row]:
         spans = [(record["started_at"], record["ended_at"]) for record in records(folder)]
         costs[num_trials] = (max(end for _, end in spans) - min(start for start, _ in spans)) / num_trials
         text = f"{done.wall_s:.0f} s, {done.peak_bytes / 2**30:.2f} GiB"
-        table.append((f"launch, {num_trials:,} trials, start to end", text, goal))
+        table.append((f"launch, {num_trials:,} trials, start to end (one run)", text, goal))
     ratio = costs[MANY] / costs[MANY // 10]
-    table.append(("  cost of a trial of them, beside one of a hundred", f"{ratio:.2f} x", "1.1 x"))
+    table.append(("  cost of a trial of them, beside one of a hundred (one run)", f"{ratio:.2f} x", "1.1 x"))
     return table
 
 

@@ -11,6 +11,8 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from analysis.best_records import EvaluationRecord
+from analysis.records import TrialRecord
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM
 from tests.narrowing import present
 from tune_jobs.spec.domains import DOMAIN_KINDS
@@ -121,6 +123,20 @@ def test_what_the_code_knows_is_on_the_pages_that_are_drawn_from_it(site: Path, 
     examples = [path for ending in ("py", "yaml") for path in (ROOT / "docs" / "examples").rglob(f"*.{ending}")]
     assert {path.name for path in examples if path.read_text().strip() not in text("examples/index.html")} == set()
     assert not any(mark in path.read_text() for path in pages for mark in ("<!-- table", "<!-- file"))
+
+
+def test_the_python_api_says_where_names_are_from_and_what_fields_are(site: Path, pages: dict[Path, Page]) -> None:
+    text = pages[site / "reference" / "python-api.html"].text
+    entries = re.findall(r"^::: ([\w.]+)$", (ROOT / "docs" / "reference" / "python-api.md").read_text(), re.MULTILINE)
+    assert len(entries) > 60
+    assert {path for path in entries if not re.search(rf"(?<![\w.]){re.escape(path)}(?![\w.])", text)} == set()
+    # TrialRecord's are inherited.
+    fields = [*EvaluationRecord.model_fields.values(), *TrialRecord.model_fields.values()]
+    described = [field.description for field in fields if field.description]
+    assert len(described) > 15
+    assert {told for told in described if told not in text} == set()
+    assert re.findall(r"\b[Ff]ield\(.*", text) == []
+    assert "model_config" not in text
 
 
 def test_no_list_table_or_code_has_run_into_a_paragraph(site: Path, pages: dict[Path, Page]) -> None:

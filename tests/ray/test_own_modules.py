@@ -140,3 +140,32 @@ def test_classes_that_cannot_be_trained_are_refused(
 
     with pytest.raises(SpecError, match=words):
         module_spec(cast("TrainedHyperparams", make_hyperparams(algorithm, values)), f"{MODULES}:{name}")
+
+
+@pytest.mark.parametrize(("algorithm", "name"), [("ppo", "RecurrentPPO"), ("dqn", "RecurrentDQN")])
+@pytest.mark.usefixtures("allowed")
+def test_a_recurrent_module_is_refused_where_it_is_built(build: Build, algorithm: Algorithm, name: str) -> None:
+    words = f"rl_module '{MODULES}:{name}' is recurrent: .* no state is carried from one step to the next"
+    with pytest.raises(SpecError, match=words) as caught:
+        build(algorithm, rl_module=f"{MODULES}:{name}")
+    assert "frame_stack" in caught.value.hint
+
+
+@pytest.mark.usefixtures("allowed")
+def test_a_module_that_says_that_it_has_no_state_trains(build: Build) -> None:
+    algo, _ = build("ppo", rl_module=f"{MODULES}:OfNoState")
+    before = {key: value.clone() for key, value in module_of(algo).state_dict().items()}
+    algo.train()
+    assert any(not torch.equal(value, before[key]) for key, value in module_of(algo).state_dict().items())
+
+
+@pytest.mark.usefixtures("allowed")
+def test_a_recurrent_module_does_not_act(build: Build, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its class has become so since it was trained."""
+    import tune_jobs_test_modules
+
+    algo, hyperparams = build("ppo", rl_module=f"{MODULES}:OwnPPO")
+    save_policy(portable(algo, hyperparams), tmp_path / "policy")
+    monkeypatch.setattr(tune_jobs_test_modules.OwnPPO, "get_initial_state", lambda self: {"h": torch.zeros(4)})
+    with pytest.raises(SpecError, match=f"{MODULES}:OwnPPO' is recurrent"):
+        load_policy(tmp_path / "policy")

@@ -134,7 +134,8 @@ def simulated(seed: int, make: Make) -> list[list[Any]]:
 
     trials = [Trial(number) for number in range(num_trials)]
     controller, steps, found = Controller(trials, rng), {}, []
-    store = SimpleNamespace(trial=lambda trial_id: SimpleNamespace(trial_id=trial_id))
+    # None has a checkpoint of before.
+    store = SimpleNamespace(trial=lambda trial_id: SimpleNamespace(trial_id=trial_id, checkpoint_iterations=tuple))
     with mock.patch("tune_jobs.ray_tune.population.copy_latest_checkpoint", copy):
         judge = make(spec, store, records.__getitem__, change)
         for trial in trials:

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 from analysis.records import IterationRecord
 from tune_jobs.search.bandit import MOST_INTERVALS, Gain, Next, _unit, _value, propose
 from tune_jobs.search.gains import Evaluations
+from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.domains import Domain
 from tune_jobs.store.sweep_store import SweepStore
 
@@ -23,10 +24,15 @@ def proposed(coming: Next, gains: list[Gain], seed: int = 0) -> dict[str, Any]:
     return propose(coming, SPACE, gains, np.random.default_rng(seed), 0.25)
 
 
-@pytest.mark.parametrize("num", [2, 3])
-def test_two_known_intervals_are_enough_for_the_model(num: int) -> None:
+@pytest.mark.parametrize(("num", "least"), [(2, 0.5), (3, 0.7)])
+def test_two_known_intervals_are_enough_for_the_model(num: int, least: float) -> None:
+    # The greater the value, the more was gained; a mutation is drawn anew, or 0.8 or 1.2 times 0.5.
     gains = [Gain(1.0 + at, 0.0, float(at), {"x": 0.2 + 0.3 * at}) for at in range(num)]
-    assert 0.0 <= proposed(Next(num + 1.0, 0.0, {"x": 0.5}, []), gains)["x"] <= 1.0
+    coming = Next(num + 1.0, 0.0, {"x": 0.5}, [])
+    for seed in range(6):
+        found = proposed(coming, gains, seed)["x"]
+        assert found != mutate(coming.point, SPACE, np.random.default_rng(seed), 0.25)["x"]
+        assert found > least
 
 
 def test_the_newest_intervals_alone_are_modelled_in_whatever_order_they_come() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.statistics import bootstrap_t_interval
+from analysis.statistics.few_seeds import _pivots
 
 
 @pytest.mark.parametrize("values", [[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]])
@@ -28,5 +29,11 @@ def test_one_end_without_a_bound_is_said() -> None:
 
 
 def test_ends_are_the_nearest_resamples_outwards() -> None:
-    found = bootstrap_t_interval([1.0, 2.0, 4.0, 8.0, 9.0, 7.0], rng=np.random.default_rng(0), num_resamples=2)
-    assert found.lower < found.upper
+    values = np.array([1.0, 2.0, 4.0, 8.0, 9.0, 7.0])
+    error = values.std(ddof=1) / math.sqrt(len(values))
+    pivots = np.sort(_pivots(values, np.random.default_rng(0), 31))
+    # 2.5 % of the way through 31 resamples is at 0.75, and 97.5 % at 29.25: outwards are the first and the last.
+    assert pivots[0] < pivots[1] < pivots[29] < pivots[30] < math.inf
+    found = bootstrap_t_interval(values, rng=np.random.default_rng(0), num_resamples=31)
+    ends = (values.mean() - pivots[30] * error, values.mean() - pivots[0] * error)
+    assert (found.lower, found.upper) == pytest.approx(ends)

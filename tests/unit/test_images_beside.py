@@ -142,6 +142,12 @@ def test_what_is_beside_the_image_and_each_pixel_matter(tmp_path: Path) -> None:
     assert without == (3 + np.flatnonzero(unseen)).tolist()
 
 
+def test_a_batch_of_no_observations_has_no_actions(tmp_path: Path) -> None:
+    policy = untrained_policy(FINE, {}, PPOHyperparams(**SMALL), tmp_path)
+    assert policy.act(observations(1, high=1.0)).shape == (1,)
+    assert policy.act(np.zeros((0, NUM_SEEN), np.float32)).shape == (0,)
+
+
 def changed(row: NDArray[np.float32], place: int) -> NDArray[np.float32]:
     other = row.copy()
     other[0, place] += 1

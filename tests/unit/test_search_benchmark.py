@@ -20,8 +20,8 @@ from policies.envs import modules as env_modules
 from policies.portable.network import Layer, PolicyNetwork
 from tests.benchmarks.search import confirmed_runs, envs
 from tests.benchmarks.search import trainings as module
-from tests.benchmarks.search.__main__ import DATA
 from tests.benchmarks.search.all_runs import run_all
+from tests.benchmarks.search.kept import DATA
 from tests.benchmarks.search.pack_trainer import ENVS
 from tests.benchmarks.search.runs import METHODS, Run, mean_or_worst, run
 from tests.benchmarks.search.same_task import AnotherTaskError, check_same_task
@@ -197,8 +197,8 @@ def test_what_no_point_is_to_blame_for_is_no_failed_training(monkeypatch: pytest
 
 
 def kept(*values: float) -> dict[str, Any]:
-    runs = [{"scores": [value - 1, value], "best": {}, "test": value - 2} for value in values]
-    return {"date": "2026-11-23", "machine": "a machine", "runs": runs}
+    made = {"date": "2026-11-23", "machine": "a machine"}
+    return {"runs": [{**made, "scores": [value - 1, value], "best": {}, "test": value - 2} for value in values]}
 
 
 def test_ranks_leave_out_a_task_that_a_method_has_run_less_often() -> None:
@@ -337,7 +337,7 @@ def test_settings_with_more_seeds_are_ranked_by_what_is_expected_of_them() -> No
 
 def test_tables_have_runs_with_confirm_on_test_seeds_alone() -> None:
     def kept(score: float, test: float) -> dict[str, Any]:
-        return {"date": "2026-01-01", "machine": "one", "runs": [{"scores": [score], "test": test}] * 5}
+        return {"runs": [{"date": "2026-01-01", "machine": "one", "scores": [score], "test": test}] * 5}
 
     found = {("cartpole-ppo", "random"): kept(500.0, 400.0), ("cartpole-ppo", "gp"): kept(500.0, 410.0)}
     without = list(tables(found))

@@ -2,8 +2,11 @@
 
 import http.server
 import json
+import os
+import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +18,7 @@ from sqlalchemy import Engine, select
 from sweep_folders import make_sweep_folder
 
 from policies.errors import SpecError
+from tune_jobs.service import telling
 from tune_jobs.service.config import ServiceConfig
 from tune_jobs.service.database.opening import open_database, sqlite_url
 from tune_jobs.service.database.tables import messages
@@ -164,6 +168,65 @@ def test_a_command_that_fails_is_tried_again(engine: Engine, command: list[str],
         row = connection.execute(select(messages)).mappings().one()
     assert told in row["error"]
     assert row["next_at"] is not None
+
+
+def told_to(engine: Engine, script: str, *arguments: Path) -> tuple[int, str | None]:
+    """Have a script of sh told something; return how many messages arrived, and the error that is kept."""
+    teller = Teller(engine, [COMMAND + json.dumps(["sh", "-c", script, "sh", *map(str, arguments)])])
+    teller.tell("sweep.ended", {"sweep": "a"})
+    arrived = teller.send_due()
+    with engine.begin() as connection:
+        return arrived, connection.execute(select(messages.c.error)).scalar_one()
+
+
+def runs(process_id: int) -> bool:
+    """Whether a process is there that has not ended: where nobody takes its end, a killed one stays a zombie."""
+    try:
+        return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_what_a_command_leaves_in_the_background_neither_holds_its_message_nor_is_ended(
+    engine: Engine, tmp_path: Path
+) -> None:
+    began = time.monotonic()
+    # With the command's input and outputs: without `<&3` a shell gives it /dev/null.
+    arrived = told_to(engine, 'exec 3<&0; sleep 90 <&3 & echo $! > "$1"; exit 0', tmp_path / "id")
+    left = int((tmp_path / "id").read_text())
+    try:
+        assert arrived == (1, None)
+        assert time.monotonic() - began < 20.0
+        assert runs(left)
+    finally:
+        os.kill(left, signal.SIGKILL)
+
+
+def test_a_command_that_takes_too_long_is_ended_with_what_it_began(
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(telling, "_COMMAND_TIMEOUT_S", 2.0)
+    error = told_to(engine, 'sleep 90 & echo $! $$ > "$1"; wait', tmp_path / "ids")
+    inner, own = map(int, (tmp_path / "ids").read_text().split())
+    try:
+        assert error == (0, "it took longer than 2 s")
+        until = time.monotonic() + 10.0
+        while runs(inner) and time.monotonic() < until:
+            time.sleep(0.05)
+        assert not runs(inner)
+        assert not runs(own)
+    finally:
+        if runs(inner):
+            os.kill(inner, signal.SIGKILL)
+
+
+def test_of_what_a_failed_command_says_the_end_is_kept(engine: Engine) -> None:
+    arrived, error = told_to(engine, "yes 'line after line' | head -500 >&2; echo 'the end é' >&2; exit 3")
+    assert arrived == 0
+    assert error is not None
+    assert error.startswith("exit code 3: ")
+    assert error.endswith("line after line\nthe end é")
+    assert len(error) == len("exit code 3: ") + 300
 
 
 def test_a_message_that_can_not_even_be_made_keeps_no_other_from_being_told(

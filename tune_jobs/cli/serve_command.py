@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tune_jobs.service.logs import LogFormat
 
 database_option = click.option(
-    "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE",
+    "--database", metavar="URL", envvar="TUNE_JOBS_DATABASE", show_envvar=True,
     help="postgresql://USER@HOST/NAME.  [default: an SQLite file in the service's folder]",
 )  # fmt: skip
 folder_option = click.option(
@@ -53,8 +53,10 @@ folder_option = click.option(
     "--webhook-secret", metavar="SECRET", envvar="TUNE_JOBS_WEBHOOK_SECRET", show_envvar=True,
     help="What messages to webhooks are signed with (Standard Webhooks); better set by the variable.",
 )  # fmt: skip
-@click.option("--run-command", metavar="COMMAND",
-              help="Run when something happens, without a shell, with the message as its input.")  # fmt: skip
+@click.option(
+    "--run-command", metavar="COMMAND",
+    help="Run when something happens, without a shell, with the message as its input; it has a minute.",
+)  # fmt: skip
 @click.option("--stuck", "stuck_s", type=click.FloatRange(1), default=900.0, show_default=True, metavar="SECONDS",
               help="A running sweep that takes no env step for so long is told to be stuck.")  # fmt: skip
 @click.option("--public-name", "public_names", multiple=True, metavar="NAME[:PORT]",

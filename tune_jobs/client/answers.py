@@ -100,7 +100,7 @@ class FileOfSweep(_Answer):
 
     path: str = Field(description="What `download` takes.")
     num_bytes: int
-    modified_at: float
+    modified_at: float = Field(description="Unix time, seconds.")
     media_type: str
 
 

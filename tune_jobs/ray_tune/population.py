@@ -27,6 +27,7 @@ from analysis.records import ChangeRecord, TrialRecord
 from policies import random_streams
 from policies.errors import CheckpointError, SpecError
 from tune_jobs.plan.points import point_hyperparams
+from tune_jobs.ray_tune.pointers import latest_iteration, pointer_to, result_of
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
 from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, is_starting, name_of, standing_of
 from tune_jobs.search.bandit import Next, propose
@@ -318,7 +319,10 @@ class PopulationScheduler(TuneScheduler):
         self._read = read
         self._change = change
         self._saved: dict[str, Any] = {}
-        """Tune's pointer to what each trial saved at its last comparison, or a future of it."""
+        """Tune's pointer to what each trial saved at its last comparison in this run, or a future of it.
+
+        None: nothing was saved there, or the trial went on from a copy.
+        """
 
     @override
     def on_trial_result(self, tune_controller: TuneController, trial: Trial, result: dict[str, Any]) -> str:
@@ -362,18 +366,27 @@ class PopulationScheduler(TuneScheduler):
         }
         record = self._read(name_of(trial)).model_copy(update=reached)
         take_over(self._spec, self._store, record, decision, self._change)
+        # Its own checkpoints are those of before the copy.
+        self._saved.setdefault(name_of(trial), None)
         controller.pause_trial(trial, should_checkpoint=False)
         trial.run_metadata.checkpoint_manager._latest_checkpoint_result = pointer  # noqa: SLF001
 
     def _pointer(self, trial_id: str) -> Any:
         """Return Tune's pointer to what a trial saved at its last comparison.
 
+        Of one that was compared last before the sweep was resumed, that is its latest checkpoint on disk.
+
         Raises:
-            CheckpointError: It has not saved anything since.
+            CheckpointError: There is none.
         """
-        saved = self._saved.get(trial_id)
-        if saved is not None and hasattr(saved, "resolve"):
+        if trial_id not in self._saved:
+            trial = self._store.trial(trial_id)
+            if not latest_iteration(trial):
+                raise CheckpointError(f"Trial {trial_id} has no checkpoint yet.")
+            return result_of(pointer_to(self._store.place, trial))
+        saved = self._saved[trial_id]
+        if hasattr(saved, "resolve"):
             saved = self._saved[trial_id] = saved.resolve()
         if saved is None or saved.checkpoint is None:
-            raise CheckpointError(f"Trial {trial_id} has not saved a checkpoint yet.")
+            raise CheckpointError(f"Trial {trial_id} saved no checkpoint when it was compared last.")
         return copy.copy(saved)

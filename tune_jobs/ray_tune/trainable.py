@@ -32,6 +32,7 @@ from policies.parents import end_with_parent, is_gone
 from tune_jobs.ray_tune.joined_nodes import refusal
 from tune_jobs.ray_tune.lean import Sealed
 from tune_jobs.ray_tune.lost_nodes import DrainNotice, NodeRefusedError
+from tune_jobs.ray_tune.pointers import POINTER, latest_iteration, pointer_to, result_of
 from tune_jobs.ray_tune.scheduling import score_of
 from tune_jobs.ray_tune.tune_scheduler import METRIC
 from tune_jobs.spec.engines import engine_on_record
@@ -48,9 +49,6 @@ from tune_jobs.training.trial_loop import TrialLoop
 
 # Reporting every iteration of a fast env would take longer than the iteration.
 REPORT_INTERVAL_S = 1.0
-_POINTER = "pointer.json"
-_NO_FOLDER = "/no-folder-of-checkpoints-of-tune"
-"""Where Tune believes a checkpoint to be; nobody looks there."""
 _LONGEST_WATCH_S = 1e9
 """Thirty years, in seconds; the fault handler's clock overflows at 300 years."""
 
@@ -281,17 +279,11 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         }
 
     def save(self, checkpoint_dir: str | None = None) -> _TrainingResult:
-        """Save when Tune pauses the trial, and return its pointer to the checkpoint.
-
-        Tune (2.60) would carry it through files in the folder of its run, which is one of the driver's machine: another
-        node has none where the sweep is in an object store. So it is carried in the result itself.
-        """
+        """Save when Tune pauses the trial, and return its pointer to the checkpoint."""
         with tempfile.TemporaryDirectory() as folder:
             self.save_checkpoint(folder)
-            pointer = (Path(folder) / _POINTER).read_text(encoding="utf-8")
-        metrics = {**(self._last_result or {}), _POINTER: pointer}
-        # A checkpoint that is none would be taken for a save that failed.
-        return _TrainingResult(tune.Checkpoint.from_directory(checkpoint_dir or _NO_FOLDER), metrics)
+            pointer = (Path(folder) / POINTER).read_text(encoding="utf-8")
+        return result_of(pointer, self._last_result, checkpoint_dir)
 
     def restore(self, checkpoint_path: _TrainingResult) -> None:
         """Be given what `save` returned, of this trial or of another one.
@@ -300,7 +292,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
             CheckpointError: The checkpoint of the pause is not there.
         """
         with tempfile.TemporaryDirectory() as folder:
-            (Path(folder) / _POINTER).write_text(checkpoint_path.metrics[_POINTER], encoding="utf-8")
+            (Path(folder) / POINTER).write_text(checkpoint_path.metrics[POINTER], encoding="utf-8")
             super().restore(_TrainingResult(tune.Checkpoint.from_directory(folder), checkpoint_path.metrics))
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
@@ -308,8 +300,8 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         place, trial_id = self._trial
         if self._loop is not None:
             self._loop.pause()
-        pointer = {"sweep_place": place, "trial_id": trial_id, "iteration": _latest_iteration(place, trial_id)}
-        (Path(checkpoint_dir) / _POINTER).write_text(json.dumps(pointer), encoding="utf-8")
+        pointer = pointer_to(place, open_sweep(place).trial(trial_id))
+        (Path(checkpoint_dir) / POINTER).write_text(pointer, encoding="utf-8")
 
     def load_checkpoint(self, checkpoint: str) -> None:
         """Check that the sweep folder has the checkpoint of Tune's pause or a newer one, for the next step.
@@ -323,12 +315,13 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         if self._refusal is not None:
             # The next step says so.
             return
-        pointer = json.loads((Path(checkpoint) / _POINTER).read_text(encoding="utf-8"))
+        pointer = json.loads((Path(checkpoint) / POINTER).read_text(encoding="utf-8"))
         place, trial_id = self._trial
-        latest = _latest_iteration(place, trial_id)
+        trial = open_sweep(place).trial(trial_id)
+        latest = latest_iteration(trial)
         # It is newer if the trial continued after a pause and its process died: Tune uses the pause's pointer again.
         # It is older if that checkpoint was damaged, and the trial has continued from the one before.
-        known = max(latest, open_sweep(place).trial(trial_id).latest_damaged())
+        known = max(latest, trial.latest_damaged())
         if pointer["trial_id"] == trial_id and known < pointer["iteration"]:
             raise CheckpointError(
                 f"Trial {trial_id} was paused at iteration {pointer['iteration']}; its latest checkpoint is {latest}.",
@@ -343,8 +336,3 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         for evaluator in self._evaluators.values():
             evaluator.close()
         self._log.close()
-
-
-def _latest_iteration(place: str, trial_id: str) -> int:
-    """Return the latest iteration of a trial's checkpoints on disk, damaged or not; 0 if it has none."""
-    return max(open_sweep(place).trial(trial_id).checkpoint_iterations(), default=0)

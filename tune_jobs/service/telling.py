@@ -7,6 +7,7 @@ perhaps twice. A receiver knows a message that it has by its id.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import hmac
 import http.client
@@ -14,7 +15,9 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
+import tempfile
 import threading
 import time
 import urllib.error
@@ -44,6 +47,10 @@ _SHORTEST_PATH = 8
 """Of a path that may be a secret, in characters: `/hook` is a word, and not one."""
 _TIMEOUT_S = 15.0
 _COMMAND_TIMEOUT_S = 60.0
+_KILLED_S = 5.0
+"""How long a killed command may take to be gone."""
+_READ_BYTES = 2_000
+"""Of what a command wrote to its standard error, from the end."""
 _KEPT_S = 7 * 24 * 3_600.0
 _SENDING = "Messages can't be sent"
 _log = logging.getLogger(__name__)
@@ -270,16 +277,31 @@ _opener = urllib.request.build_opener(_NoRedirects)
 def _run_command(command: Sequence[str], message_id: str, event: str, body: str) -> str | None:
     told = {"TUNE_JOBS_MESSAGE_ID": message_id, "TUNE_JOBS_EVENT": event}
     try:
-        done = subprocess.run(  # noqa: S603 (the operator's own)
-            list(command), input=body.encode(), env=os.environ | told, capture_output=True,
-            timeout=_COMMAND_TIMEOUT_S, check=False, start_new_session=True,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        # Its own words have the command's arguments.
-        return f"it took longer than {_COMMAND_TIMEOUT_S:g} s"
+        # No pipes for what it says: they end with the last process that the command began, and may be held for long by
+        # one in the background, which is left to run. The command's own exit counts.
+        with tempfile.TemporaryFile() as errors:
+            process = subprocess.Popen(  # noqa: S603 (the operator's own)
+                list(command), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors,
+                env=os.environ | told, start_new_session=True,
+            )  # fmt: skip
+            try:
+                process.communicate(body.encode(), _COMMAND_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                _kill_group(process)
+                # Its own words have the command's arguments.
+                return f"it took longer than {_COMMAND_TIMEOUT_S:g} s"
+            errors.seek(max(0, errors.seek(0, os.SEEK_END) - _READ_BYTES))
+            said = errors.read().decode("utf-8", "replace").strip()
     except (OSError, subprocess.SubprocessError) as error:
         return str(error)[:500]
-    if done.returncode == 0:
+    if process.returncode == 0:
         return None
-    said = done.stderr.decode("utf-8", "replace").strip()
-    return f"exit code {done.returncode}" + (f": {said[-300:]}" if said else "")
+    return f"exit code {process.returncode}" + (f": {said[-300:]}" if said else "")
+
+
+def _kill_group(process: subprocess.Popen[bytes]) -> None:
+    """End a command that leads a group of its own, with all of the group: the next attempt is to be alone."""
+    # One that has become another user's, as by sudo, may not be ended, and is not waited for.
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait(_KILLED_S)

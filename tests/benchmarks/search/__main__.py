@@ -7,18 +7,13 @@ It trains what is missing (hours), then writes the tables into docs/search-bench
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 from contextlib import closing
-from datetime import UTC, datetime
-from pathlib import Path
-from typing import Any
 
-from tests.benchmarks.ppo import machine_name
 from tests.benchmarks.search.all_runs import run_all
 from tests.benchmarks.search.confirmed_runs import CONFIRMED
-from tests.benchmarks.search.runs import METHODS, NUM_RUNS, Run, finite
+from tests.benchmarks.search.kept import DATA, keep, read_runs
+from tests.benchmarks.search.runs import METHODS, NUM_RUNS
 from tests.benchmarks.search.same_task import AnotherTaskError, check_same_task
 from tests.benchmarks.search.schedulers import SCHEDULERS
 from tests.benchmarks.search.tables import tables
@@ -26,37 +21,8 @@ from tests.benchmarks.search.tasks import HERE, TASKS
 from tests.benchmarks.search.trainings import Trainings
 from tests.benchmarks.search.whole_runs import WholeRuns
 
-DATA = HERE / "data"
 PAGE = HERE.parents[2] / "docs" / "search-benchmark.md"
 BEGIN, END = "<!-- bench-search: begin -->", "<!-- bench-search: end -->"
-
-
-def runs_file(task: str, method: str) -> Path:
-    """Return the file of a method's runs of a task."""
-    return DATA / f"{task}.{method}.json"
-
-
-def keep(task: str, runs: dict[tuple[str, int], Run]) -> None:
-    """Write the runs of a task, a file a method, with the machine and the date."""
-    for method in {name for name, _ in runs}:
-        found = [run for (name, _), run in sorted(runs.items(), key=lambda item: item[0]) if name == method]
-        about: dict[str, Any] = {
-            "task": task,
-            "method": method,
-            "date": datetime.now(UTC).date().isoformat(),
-            "machine": machine_name(),
-            "python": platform.python_version(),
-            "runs": [
-                {"scores": list(map(finite, run.scores)), "best": run.best, "test": finite(run.test)} for run in found
-            ],
-        }
-        runs_file(task, method).write_text(json.dumps(about, indent=1) + "\n")
-
-
-def read_runs(task: str, method: str) -> dict[str, Any] | None:
-    """Return what was kept of a method's runs of a task; None: nothing."""
-    file = runs_file(task, method)
-    return json.loads(file.read_text()) if file.exists() else None
 
 
 def write_page(lines: list[str]) -> None:

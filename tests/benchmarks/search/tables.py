@@ -11,6 +11,7 @@ from scipy import stats
 
 from analysis.wording import counted
 from tests.benchmarks.search.confirmed_runs import CONFIRMED
+from tests.benchmarks.search.kept import made
 from tests.benchmarks.search.runs import METHODS, NUM_RUNS
 from tests.benchmarks.search.tasks import TASKS
 from tune_jobs.spec.sections import AUTO_SEARCH
@@ -43,7 +44,7 @@ def tables(kept: Kept) -> Iterator[str]:
     for named in dict.fromkeys(((*default, *confirmed), (*methods, *confirmed)) if confirmed else ()):
         yield from _ranks(kept, tasks, named, {"test": "on test seeds"})
     yield ""
-    yield from _made(kept, tasks, everything)
+    yield made(found for task in tasks for method in everything if (found := kept.get((task, method))) is not None)
 
 
 def _most_often(kept: Kept, task: str, methods: Sequence[str]) -> tuple[str, ...]:
@@ -103,9 +104,3 @@ def _ranks(kept: Kept, tasks: list[str], methods: Sequence[str], by: Mapping[str
         named = ", ".join(f"{method} {mean:.2f}" for method, mean in zip(methods, means, strict=True))
         told.append(f"{words}: {named}")
     yield f"Mean rank of {len(methods)} over {counted(len(whole), 'task')}, {'; '.join(told)}."
-
-
-def _made(kept: Kept, tasks: list[str], methods: list[str]) -> Iterator[str]:
-    made = (kept.get((task, method)) for task in tasks for method in methods)
-    seen = {(found["date"], found["machine"]) for found in made if found is not None}
-    yield "Made " + "; ".join(f"{date} on {machine}" for date, machine in sorted(seen)) + "."

@@ -49,3 +49,27 @@ class PlainDQN(DefaultDQNTorchRLModule):  # type: ignore[misc]
 
 class NoValues(TorchRLModule):  # type: ignore[misc]
     """Cannot learn PPO."""
+
+
+class RecurrentPPO(OwnPPO):
+    """Asks for what it gave at the step before."""
+
+    def get_initial_state(self) -> dict[str, Any]:
+        return {"h": torch.zeros(4)}
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        return {**super()._forward(batch), "state_out": {"h": batch["state_in"]["h"] + 1.0}}
+
+
+class RecurrentDQN(OwnDQN):
+    """Asks for what it gave at the step before."""
+
+    def get_initial_state(self) -> dict[str, Any]:
+        return {"h": torch.zeros(4)}
+
+
+class OfNoState(OwnPPO):
+    """Says itself that it is not recurrent."""
+
+    def get_initial_state(self) -> dict[str, Any]:
+        return {}
