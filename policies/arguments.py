@@ -66,13 +66,22 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
             takes = f"it takes {', '.join(signature.parameters)}"
             raise TypeError(f"{function.__name__}() {error}: {takes}.{nearest}") from None
         for name, value in bound.arguments.items():
-            fitted = _fit(value, kinds()[name])
-            if fitted is _WRONG:
-                raise SpecError(f"The argument {name} is {shortened(value)}.", f"Give {_words(kinds()[name])}.")
-            bound.arguments[name] = fitted
+            bound.arguments[name] = fit_argument(name, value, kinds()[name])
         return function(*bound.args, **bound.kwargs)
 
     return call
+
+
+def fit_argument(name: str, value: Any, kind: Any) -> Any:
+    """Return an argument as a checked function gets it: converted to its kind, which is as annotations name it.
+
+    Raises:
+        SpecError: It is of another kind.
+    """
+    fitted = _fit(value, kind)
+    if fitted is _WRONG:
+        raise SpecError(f"The argument {name} is {shortened(value)}.", f"Give {_words(kind)}.")
+    return fitted
 
 
 def _fit(value: Any, kind: Any) -> Any:

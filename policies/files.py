@@ -115,6 +115,14 @@ def absolute(path: Path) -> Path:
         ) from error
 
 
+def expanded(path: str | Path) -> Path:
+    """Replace a ~ at the beginning of a path by a home folder; the ~ of an unknown user is kept as a name."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
+
+
 def write_atomic(path: Path, data: bytes | str) -> None:
     """Write a file so that its name always holds either the old content or all of the new.
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.policy import NetworkPolicy, Policy, RandomPolicy
 from policies.arguments import checked
+from policies.files import expanded
 from policies.portable.file import (
     BASELINE_KINDS,
     PortablePolicy,
@@ -48,11 +49,11 @@ def load_policy(path: str | Path) -> Policy:
     A policy whose network is an RLModule of the user's own needs both, and its class has to be in an allowed module.
 
     Args:
-        path: `policy.json`, `policy.safetensors`, or the folder that holds them.
+        path: `policy.json`, `policy.safetensors`, or the folder that holds them; a ~ at its beginning is a home folder.
 
     Raises:
         NotFoundError: There is no such file.
         CheckpointError: The file is incomplete, altered, or of another format.
         SpecError: It needs a class from a module that is not allowed.
     """
-    return policy_from_portable(read_policy(Path(path)))
+    return policy_from_portable(read_policy(expanded(path)))

@@ -113,6 +113,8 @@ class Cluster:
             "RAY_AUTH_TOKEN_PATH": str(token),
             # Where Ray keeps its files, and the address of the cluster that `auto` means.
             "RAY_TMPDIR": str(self.temporary),
+            # Where it is kept to which addresses jobs were sent with the token.
+            "XDG_STATE_HOME": str(self.temporary / "state"),
             "RAY_USAGE_STATS_ENABLED": "0",
             # Else one `ray://` client in twenty is refused, half a minute after it asked (ray issue 63202).
             "GRPC_ENABLE_FORK_SUPPORT": "0",

@@ -249,6 +249,7 @@ def test_the_services_agree_on_the_heads_ports(compose: dict[str, Any]) -> None:
     assert "--address=head:6379" in worker["command"]
     assert "--ray-client-server-port=10001" in head["command"]
     assert launcher["environment"]["RAY_ADDRESS"] == "ray://head:10001"
+    assert launcher["environment"]["RAY_API_SERVER_ADDRESS"] == "http://head:8265"
     assert launcher["profiles"] == ["launch"]
     for service in (head, worker):
         # `ray health-check` would load Ray each time.

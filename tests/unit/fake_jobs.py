@@ -4,9 +4,12 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import pytest
+
+from tune_jobs.ray_tune import known_clusters
 
 SUBMIT = "/api/jobs/"
 
@@ -15,6 +18,7 @@ class Head(ThreadingHTTPServer):
     """Attributes: what a test sets, and what was sent.
 
     token: What requests have to show; None: nothing.
+    shown: What requests had as Authorization, one after the other.
     jobs: The answers about jobs, by id.
     on_submit: Called with a submission; returns what becomes of the job, or raises what the head refuses it with.
     """
@@ -25,6 +29,7 @@ class Head(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.address = f"http://127.0.0.1:{self.server_address[1]}"
         self.token: str | None = None
+        self.shown: list[str | None] = []
         self.jobs: dict[str, dict[str, Any]] = {}
         self.submitted: list[dict[str, Any]] = []
         self.packages: dict[str, bytes] = {}
@@ -56,6 +61,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, of: Callable[[bytes], tuple[int, str]]) -> None:
         content = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         shown = self.headers.get("Authorization")
+        self.head.shown.append(shown)
         if self.head.token is None or shown == f"Bearer {self.head.token}":
             status, text = of(content)
         elif shown is None:
@@ -98,9 +104,15 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def head(monkeypatch: pytest.MonkeyPatch) -> Iterator[Head]:
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "TUNE_JOBS_JOB"):
+def head(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Head]:
+    for name in (
+        "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_ADDRESS", "RAY_API_SERVER_ADDRESS",
+        "TUNE_JOBS_JOB",
+    ):  # fmt: skip
         monkeypatch.delenv(name, raising=False)
+    # Nobody has sent a job anywhere yet, and what a test sends is not kept for this machine's user.
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(known_clusters, "_noted", set())
     server = Head()
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True)
     thread.start()

@@ -1,8 +1,11 @@
 """A point that somebody chooses: its number, its values, what is refused, and who learns from it."""
 
 import json
+import pickle
+import pkgutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -289,6 +292,32 @@ def test_a_point_that_is_there_is_refused_by_its_trial(store: SweepStore) -> Non
         sweeps.inject(store.folder, {"lr": lr}, progress="none")
     assert f"tune-jobs replicate {store.folder}" in caught.value.hint
     assert store.read_record().chosen_points == ()
+
+
+def test_in_a_thread_what_another_process_can_be_sent_is_decided_before_it_is_started(
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = []
+    monkeypatch.setattr("tune_jobs.sweeps.apart.call_apart", lambda *request: sent.append(pickle.dumps(request)))
+    wrong = {"lr": lambda: 5e-3}
+    with ThreadPoolExecutor(1) as thread:
+        told = [
+            asked.exception()
+            for asked in (
+                thread.submit(sweeps.inject, store.folder, wrong),
+                thread.submit(
+                    sweeps.inject, store.folder, MappingProxyType({"lr": 5e-3, "more": MappingProxyType({})})
+                ),
+            )
+        ]
+    with pytest.raises(SpecError) as here:
+        sweeps.inject(store.folder, wrong)
+    assert here.value.message.startswith("point: lr: <function ")
+    assert isinstance(told[0], SpecError)
+    assert (told[0].message, told[0].hint, told[1]) == (here.value.message, here.value.hint, None)
+    ((function, (_, point), _),) = map(pickle.loads, sent)
+    assert pkgutil.resolve_name(function).__name__ == "inject_plain"
+    assert point == {"lr": 5e-3, "more": {}}
 
 
 def test_a_value_in_another_form_is_the_same_point() -> None:

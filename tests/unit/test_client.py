@@ -174,6 +174,33 @@ def test_files_are_downloaded_whole_or_not_at_all(looking: Client, tmp_path: Pat
         looking.download("mine", "policy", tmp_path)
 
 
+def test_a_download_goes_to_the_home_folder_and_to_no_url(
+    looking: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home, working = tmp_path / "home", tmp_path / "working"
+    for folder in (home, working):
+        folder.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(working)
+    assert looking.download("mine", "films/after_mp4", "~/new/film.mp4") == home / "new" / "film.mp4"
+    assert (home / "new" / "film.mp4").read_bytes() == FILM
+    for url in ("s3://ann:s3cret@bucket/film.mp4", Path("s3://bucket/film.mp4")):
+        with pytest.raises(SpecError, match="for what is written on this machine") as caught:
+            looking.download("mine", "films/after_mp4", url)
+        assert "s3cret" not in str(caught.value)
+    assert list(working.iterdir()) == []
+
+
+def test_no_folder_is_made_for_what_is_not_there(looking: Client, tmp_path: Path) -> None:
+    for sweep, path in (("mine", "report/none.html"), ("none", "policy")):
+        with pytest.raises(NotFoundError):
+            looking.download(sweep, path, tmp_path / "new" / "file")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CannotRunError, match="file"):
+        looking.download("mine", "policy", tmp_path / "file" / "policy.zip")
+
+
 # -- refusals are the errors of this machine
 
 

@@ -1,6 +1,8 @@
 """Values that a caller gives a client: NumPy's are taken, and what JSON can't hold is the error of this machine."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from sweep_folders import make_sweep_folder
 
 from policies.errors import SpecError
 from tune_jobs.client import Client
+from tune_jobs.spec.file import load_spec
 from tune_jobs.sweeps import verbs
 
 # ruff: noqa: F811 - fixtures are named as arguments
@@ -67,4 +70,50 @@ WRONG: dict[str, Callable[[Client], object]] = {
 def test_what_cannot_be_sent_is_told_by_its_name(client: Client, live: Live, told: str) -> None:
     with pytest.raises(SpecError, match=f"^{told}"):
         WRONG[told](client)
+    assert live.service.queue.jobs() == []
+
+
+NO_LISTS: list[Any] = ["num_samples=2", b"num_samples=2", {"num_samples": 2}, None, 3]
+
+
+@pytest.mark.parametrize("given", NO_LISTS)
+def test_what_is_no_list_is_refused_in_the_words_of_this_machine(client: Client, live: Live, given: Any) -> None:
+    with pytest.raises(SpecError) as here:
+        load_spec(FAKE, given)
+    tagged = here.value.message.replace("overrides", "tags")
+    calls: list[tuple[str, Callable[[], object]]] = [
+        (here.value.message, lambda: client.plan(FAKE, overrides=given)),
+        (here.value.message, lambda: client.submit(FAKE, overrides=given)),
+        (tagged, lambda: client.submit(FAKE, tags=given)),
+    ]
+    if given is not None:  # which leaves the tags as they are
+        calls.append((tagged, lambda: client.change("done", tags=given)))
+    for message, call in calls:
+        with pytest.raises(SpecError) as there:
+            call()
+        assert (there.value.message, there.value.hint) == (message, here.value.hint)
+    assert live.service.queue.jobs() == []
+    assert client.sweep("done").tags == []
+
+
+def test_lists_of_other_kinds_are_taken(client: Client) -> None:
+    made = client.submit(FAKE, name="mine", overrides=("num_samples=2",), tags=("a", "b"))
+    assert client.spec(made.sweep)["num_samples"] == 2
+    assert client.change("mine", tags=np.array(["c"])).tags == ["c"]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "source", ["", "env: CartPole-v1\nalgorithm: ppo\n" * 20, "x" * 300, Path("x" * 300), "a\0b", 3]
+)
+def test_what_can_be_no_source_is_refused_in_the_words_of_this_machine(
+    client: Client, live: Live, source: Any, tmp_path: Path
+) -> None:
+    with pytest.raises(SpecError) as here:
+        verbs.create(source, storage=tmp_path / "here")
+    for call in (client.plan, client.submit):
+        with pytest.raises(SpecError) as there:
+            call(source)
+        assert there.value.message == here.value.message
+        # A client takes no SweepSpec.
+        assert there.value.hint == here.value.hint.replace(" or a SweepSpec", "")
     assert live.service.queue.jobs() == []

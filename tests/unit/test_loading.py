@@ -13,6 +13,7 @@ from store_parts import make_best, make_sweep
 from stores import LocalHarness, ObjectHarness
 
 import tune_jobs
+from policies.acting.load import load_policy as load_alone
 from policies.errors import NotFoundError
 from policies.portable.file import save_policy
 
@@ -64,6 +65,22 @@ def test_a_sweeps_best_is_loaded_by_its_folder(tmp_path: Path, monkeypatch: pyte
     # A folder that holds none is no sweep's, whatever it is called.
     with pytest.raises(NotFoundError, match="There is no policy file"):
         tune_jobs.load_policy(tmp_path)
+
+
+def test_a_tilde_is_a_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    save_policy(make_portable("CartPole-v1"), tmp_path / "p")
+    for path in ("~/p", "~/p/policy.json", "~/p/policy.safetensors", Path("~/p")):
+        assert tune_jobs.load_policy(path).env_id == load_alone(path).env_id == "CartPole-v1"
+    sweep = LocalHarness(tmp_path).storage().sweep("mine")
+    sweep.create()
+    sweep.write_record(make_sweep())
+    sweep.write_best(make_best(), make_portable("Pendulum-v1"))
+    assert tune_jobs.load_policy(f"~/{Path(sweep.place).relative_to(tmp_path)}").env_id == "Pendulum-v1"
+    # The ~ of somebody who isn't known is a name.
+    for load in (tune_jobs.load_policy, load_alone):
+        with pytest.raises(NotFoundError, match="~nobody-at-all/p"):
+            load("~nobody-at-all/p")
 
 
 def test_without_what_opens_sweeps_a_folder_that_holds_no_policy_is_none(

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -230,3 +231,12 @@ def test_json_that_is_nested_deeply_is_refused_before_anybody_is_stuck_in_it(fol
     for use in (sweeps.status, sweeps.report, sweeps.resume):
         with pytest.raises(CheckpointError, match=r"sweep\.json cannot be read as sweep: "):
             use(folder)
+
+
+def test_a_name_that_occurs_twice_among_very_many_is_found_at_once(folder: Path) -> None:
+    names = [f'"n{number}": 0' for number in range(200_000)]
+    (folder / "sweep.json").write_text("{" + ", ".join([*names, names[-1]]) + "}")
+    began = time.process_time()
+    with pytest.raises(CheckpointError, match="'n199999' occurs twice"):
+        sweeps.status(folder)
+    assert time.process_time() - began < 5.0

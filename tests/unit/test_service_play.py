@@ -19,6 +19,7 @@ from fastapi.testclient import TestClient
 from services import client, postgresql, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
+from policies.envs.modules import ENVIRONMENT_VARIABLE
 from tune_jobs.service.database.opening import sqlite_url
 from tune_jobs.service.http import play_routes
 from tune_jobs.service.http.app import make_app
@@ -101,6 +102,66 @@ def test_an_env_that_fails_is_said(client: TestClient, service: Service) -> None
     ((kind, told),) = events(answer.text)
     assert kind == "problem"
     assert "Acrobot-v1" in told["detail"]
+
+
+MARKED = """\
+from pathlib import Path
+from gymnasium.envs.classic_control import CartPoleEnv
+
+Path(__file__).with_name("imported").touch()
+
+class Pole(CartPoleEnv):
+    pass
+"""
+
+
+@pytest.fixture
+def imported(service: Service, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What is there once the module is imported that the record of a sweep allows, and names as its env's."""
+    folder = service.config.working_folder
+    (folder / "play_marked.py").write_text(MARKED)
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+    record = service.storage.sweep("done").read_record()
+    spec = record.spec | {"env": {"id": "play_marked:Pole", "args": {}}}
+    changes = {"spec": spec, "allowed_modules": ("play_marked",)}
+    service.storage.sweep("done").write_record(record.model_copy(update=changes))
+    return folder / "imported"
+
+
+@pytest.mark.parametrize("query", [{"trial": "t0003"}, {"random": True}])
+def test_what_a_record_allows_is_not_imported(client: TestClient, imported: Path, query: dict[str, Any]) -> None:
+    answer = client.get("/api/v1/sweeps/done/play", params=query | {"speed": 10})
+    assert answer.status_code == 422, answer.text
+    assert "would import the Python module 'play_marked', which this service does not allow" in answer.json()["detail"]
+    assert "`serve --allow-module play_marked`" in answer.json()["hint"]
+    assert not imported.exists()
+
+
+def test_what_the_operator_allows_is_played(client: TestClient, service: Service, imported: Path) -> None:
+    object.__setattr__(service.config, "modules", ("play_marked",))
+    answer = client.get("/api/v1/sweeps/done/play", params={"random": True, "speed": 10})
+    assert [kind for kind, _ in events(answer.text)][-1] == "end", answer.text
+    assert imported.exists()
+
+
+@pytest.mark.parametrize("random", [False, True])
+def test_a_module_of_a_network_is_needed_by_its_policy_alone(
+    client: TestClient, service: Service, *, random: bool
+) -> None:
+    record = service.storage.sweep("done").read_record()
+    changes = {"spec": record.spec | {"rl_module": "play_nets:Net"}, "allowed_modules": ("play_nets",)}
+    service.storage.sweep("done").write_record(record.model_copy(update=changes))
+    query: dict[str, Any] = {"random": True} if random else {"trial": "t0003"}
+    answer = client.get("/api/v1/sweeps/done/play", params=query | {"speed": 10})
+    assert (answer.status_code, "play_nets" in answer.text) == ((200, False) if random else (422, True))
+
+
+def test_a_module_that_only_a_record_allows_is_not_given_to_the_player(service: Service) -> None:
+    object.__setattr__(service.config, "modules", ("of_the_operator",))
+    record = service.storage.sweep("done").read_record()
+    service.storage.sweep("done").write_record(record.model_copy(update={"allowed_modules": ("of_the_record",)}))
+    request, _ = play_routes._request(service, "done", "t0003", None, False)
+    assert request["modules"] == ["of_the_operator"]
 
 
 def test_of_many_that_come_at_once_only_as_many_are_played_as_may(

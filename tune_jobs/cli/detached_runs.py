@@ -84,13 +84,15 @@ def job_facts(status: SweepStatus) -> dict[str, str] | None:
     """Return id, address and state of the job that drives a sweep or drove it last; None: no job did."""
     if status.sweep.job is None or status.place is None:
         return None
-    from tune_jobs.sweeps.detached import job_now, told_of
+    from tune_jobs.sweeps.detached import job_now, told_of, why_not_asked
     from tune_jobs.sweeps.own_job import job_of
 
     job = job_of(status.sweep, status.place)
     if job is None:
         return None
-    return {"id": job.id, "address": job.address, "state": told_of(job_now(job))}
+    refused = why_not_asked(job)
+    state = told_of(job_now(job)) if refused is None else f"not asked. {refused.message} {refused.hint}"
+    return {"id": job.id, "address": job.address, "state": state}
 
 
 def _words(verb: str, arguments: Sequence[Any], options: dict[str, Any]) -> list[str]:

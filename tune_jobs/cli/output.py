@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shlex
 import sys
 import time
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, range_text, return_text, setting_text
-from policies.errors import TuneJobsError
+from policies.errors import TuneJobsError, fit
 from tune_jobs.process.interruption import last_words
 from tune_jobs.sweeps.plain import to_json
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from tune_jobs.sweeps.verbs import SweepResult, SweepStatus
 
 _MAX_CANDIDATES = 8
+_CONTROLS = re.compile(r"[\x7f-\x9f]")
 STATUS_STYLES: dict[TrialStatus, str] = {
     "completed": "green",
     "failed": "red",
@@ -40,7 +42,9 @@ STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "runn
 
 def print_json(value: Any) -> None:
     """Print one JSON document on standard output."""
-    click.echo(json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=False))
+    text = json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=False)
+    # What JSON leaves as it is, though some terminals obey it; in a document it can only be in a string.
+    click.echo(_CONTROLS.sub(lambda found: f"\\u{ord(found.group()):04x}", text))
 
 
 def show_result(result: SweepResult, *, as_json: bool) -> None:
@@ -90,7 +94,7 @@ def print_outcome(
 
 def say_interrupted(sweep: SweepRecord, how_to_resume: str) -> None:
     """Say on standard error that a sweep was interrupted, and the command that continues it."""
-    click.echo(last_words(how_to_resume, is_done=sweep.state == "completed"), err=True)
+    click.echo(fit(last_words(how_to_resume, is_done=sweep.state == "completed")), err=True)
 
 
 def storage_option_of(storage: str | None) -> str:
@@ -317,7 +321,7 @@ def show_stop(sweep: str, *, was_running: bool, go_on: str, as_json: bool) -> No
     if as_json:
         print_json({"sweep": sweep, "was_running": was_running})
     elif was_running:
-        click.echo(f"{sweep} stops after the iterations now running; `{go_on}` continues it.")
+        click.echo(fit(f"{sweep} stops after the iterations now running; `{go_on}` continues it."))
     else:
         click.echo(f"{sweep} is not running.")
 
@@ -350,11 +354,11 @@ def show_preset(preset: Preset, *, as_json: bool) -> None:
 
 def make_console() -> Console:
     """Return the console that tables are printed to; they end at the terminal's width."""
-    from rich.console import Console
+    from tune_jobs.sweeps.fitting_console import FittingConsole
 
     # A pipe or a log has no width, and 80 columns would cut tables and paths needlessly.
     width = None if sys.stdout.isatty() else 200
-    return Console(markup=False, highlight=False, emoji=False, width=width, soft_wrap=False)
+    return FittingConsole(markup=False, highlight=False, emoji=False, width=width, soft_wrap=False)
 
 
 def make_table(*columns: str, wrapped: Sequence[str] = ("ended by", "trials")) -> Table:

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import click
 
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
-from policies.errors import NotFoundError, SpecError, TuneJobsError
+from policies.errors import NotFoundError, SpecError, TuneJobsError, fit
 from tune_jobs.cli.base import losing_what_nobody_reads, stdout_for
 from tune_jobs.cli.remote import told_here
 from tune_jobs.cli.server import Server
@@ -58,7 +58,7 @@ def run_there(
     def say(line: str) -> None:
         if progress != "none":
             with losing_what_nobody_reads(False):  # noqa: FBT003
-                click.echo(line, err=True)
+                click.echo(fit(line), err=True)
 
     with server.client() as client, stdout_for(as_json=as_json):
         found = _done(server, client, verb, arguments, options, say)

@@ -16,7 +16,7 @@ from tune_jobs.client.downloads import download
 from tune_jobs.client.event_stream import Event, follow
 from tune_jobs.client.looking import Looking
 from tune_jobs.client.problems import LostConnectionError, NoServiceError
-from tune_jobs.client.sources import Source, plain_values, request_of
+from tune_jobs.client.sources import Source, listed, plain_values, request_of
 
 _PLAN_S = 600.0
 """How long a plan may take: environments are made and stepped for it."""
@@ -39,7 +39,9 @@ class Client(Looking):
         patience_s: How long the service may be away while it is followed or waited for, in seconds.
 
     Raises:
-        SpecError: The address, the token or the certificates are none.
+        SpecError: The address, the token or the certificates are none, or a variable of the environment names a proxy
+            or certificates that are none.
+        CannotRunError: A variable of the environment names a SOCKS proxy, and what that needs is not installed.
     """
 
     # -- new sweeps
@@ -90,7 +92,8 @@ class Client(Looking):
                 service has no cluster whose nodes could be waited for.
             CannotRunError: It cannot run there.
         """
-        body = request_of(source, overrides, name) | plain_values(priority=priority, note=note, tags=list(tags))
+        told = plain_values(priority=priority, note=note, tags=listed("tags", tags))
+        body = request_of(source, overrides, name) | told
         if wait_for_nodes is not None:
             body |= plain_values(wait_for_nodes=wait_for_nodes)
         if key and not (key.isascii() and key.isprintable()):
@@ -163,7 +166,7 @@ class Client(Looking):
         Raises:
             ConflictError: A priority is given, and no job of the sweep waits.
         """
-        given = {"priority": priority, "note": note, "tags": None if tags is None else list(tags)}
+        given = {"priority": priority, "note": note, "tags": None if tags is None else listed("tags", tags)}
         body = plain_values(**{key: value for key, value in given.items() if value is not None})
         return self._read(Summary, self._ask("PATCH", sweep_path(name), body=body, repeat=True))
 
@@ -188,15 +191,19 @@ class Client(Looking):
             name: The sweep.
             path: As in `files`, such as `report/index.html`; or `policy` (a ZIP archive), `trials.csv`, or
                 `trials/t0003/checkpoints/12` (a ZIP archive).
-            to: The file to write; one that is there is replaced, once the new one is whole.
+            to: The file to write; a ~ at the beginning is a home folder. One that is there is replaced, once the new
+                one is whole.
 
         Returns:
             The path of the file.
 
         Raises:
             NotFoundError: There is no such sweep or file.
+            SpecError: `to` is a URL: it is written on this machine.
         """
-        return download(self._connection, f"{API}{sweep_path(name)}/{quote(path)}", Path(to))
+        from tune_jobs.sweeps.storage import local_path
+
+        return download(self._connection, f"{API}{sweep_path(name)}/{quote(path)}", local_path(to))
 
     # -- as it happens
 

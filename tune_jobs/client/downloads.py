@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,7 +27,7 @@ def download(connection: Connection, path: str, to: Path) -> Path:
     Args:
         connection: The service.
         path: Behind the service's address.
-        to: The file to write; its folder is made.
+        to: The file to write; its folder is made, once there is something to write.
 
     Raises:
         NotFoundError: There is no such file.
@@ -34,21 +35,30 @@ def download(connection: Connection, path: str, to: Path) -> Path:
     """
     if to.is_dir():
         raise CannotRunError(f"{to} is a folder, not a file.", "Name a file.")
-    with atomic_path(to) as part, part.open("wb") as file:
-        _fetch(connection, path, file)
+    with contextlib.ExitStack() as stack:
+
+        def begin() -> BinaryIO:
+            part = stack.enter_context(atomic_path(to))
+            return stack.enter_context(part.open("wb"))
+
+        _fetch(connection, path, begin)
     return to
 
 
-def _fetch(connection: Connection, path: str, file: BinaryIO) -> None:
+def _fetch(connection: Connection, path: str, begin: Callable[[], BinaryIO]) -> None:
+    """Write what is at a path to the file that `begin` opens, once there is an answer to be written."""
+    file: BinaryIO | None = None
     tag, failed = "", 0
     while True:
-        before = file.tell()
+        before = 0 if file is None else file.tell()
         # Bytes as they are in the file: by their number a part is asked for.
         headers = {"Accept": "*/*", "Accept-Encoding": "identity"}
         if before and tag:
             headers |= {"Range": f"bytes={before}-", "If-Range": tag}
         try:
             with connection.stream("GET", path, headers=headers) as answer:
+                if file is None:
+                    file = begin()
                 if answer.status_code != 206 or _begins_at(answer.headers) != before:
                     # It is another file by now, or can't be had in parts.
                     file.seek(0)
@@ -63,7 +73,7 @@ def _fetch(connection: Connection, path: str, file: BinaryIO) -> None:
                     file.write(chunk)
         except (LostConnectionError, NoServiceError):
             # What can't be had in parts begins anew each time, and might do so without an end.
-            failed = 0 if tag and file.tell() > before else failed + 1
+            failed = 0 if tag and file is not None and file.tell() > before else failed + 1
             if failed >= _ATTEMPTS or not connection.has_answered:
                 raise
             time.sleep(_WAIT_S * 2**failed)

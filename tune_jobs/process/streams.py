@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+from policies.errors import fit
 from policies.files import open_to_append
 from tune_jobs.process.interruption import current
 
@@ -50,7 +51,7 @@ def patient_stream() -> Iterator[IO[str]]:
 def say_at_last(text: str) -> None:
     """Write a text to the real standard error, in a process that is about to end."""
     for stream in _shown_on[-1:]:
-        stream.write(f"{text}\n")
+        stream.write(f"{fit(text)}\n")
         stream.flush()
 
 

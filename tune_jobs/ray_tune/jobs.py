@@ -109,10 +109,10 @@ def token_of(environment: Mapping[str, str]) -> str | None:
 
 
 class JobsApi:
-    """The Jobs API at one address.
+    """The Jobs API at one address, which is shown Ray's token, if there is one.
 
     Args:
-        address: `http://head:8265`, or with https.
+        address: `http://head:8265`, or with https. The user has named it: see `known_clusters` for one of a record.
         timeout_s: How long an answer may take.
 
     Raises:
@@ -127,11 +127,12 @@ class JobsApi:
         self._http = httpx2.Client(
             headers={} if token is None else {"Authorization": f"Bearer {token}"},
             timeout=timeout_s,
+            # Nobody has named where a redirect leads.
             follow_redirects=False,
             # A proxy of the environment can't reach this machine's own Ray.
             trust_env=urlsplit(self.address).hostname not in _HERE,
         )
-        self._shows_token = token is not None
+        self.shows_token = token is not None
 
     def __enter__(self) -> Self:
         return self
@@ -240,7 +241,7 @@ class JobsApi:
         except (httpx2.HTTPError, httpx2.InvalidURL) as error:
             raise self._not_ray(said_by(error) or type(error).__name__) from error
         if answer.status_code in (401, 403):
-            shown = "does not accept this machine's token" if self._shows_token else "wants a token"
+            shown = "does not accept this machine's token" if self.shows_token else "wants a token"
             raise CannotRunError(
                 f"The Ray cluster at {self.address} {shown}.",
                 "Set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH to the cluster's token.",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -96,8 +97,8 @@ def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object, or refuse it if a name occurs twice, as different readers would use different values."""
     data = dict(pairs)
     if len(data) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in data if names.count(name) > 1)
+        times = Counter(name for name, _ in pairs)
+        twice = next(name for name in data if times[name] > 1)
         raise ValueError(f"{twice[:80]!r} occurs twice")
     return data
 

@@ -18,7 +18,7 @@ from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import resume_command
 from tune_jobs.sweeps.current_best import has_current_best
-from tune_jobs.sweeps.detached import failure_of, job_now, ran
+from tune_jobs.sweeps.detached import failure_of, job_now, ran, why_not_asked
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.live_view import shown
 from tune_jobs.sweeps.monitor import SweepMonitor
@@ -46,7 +46,8 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
 
     Raises:
         NotFoundError: There is no such sweep.
-        CannotRunError: Nothing runs it, and it is not done; or the process that ran it ended without saying so.
+        CannotRunError: Nothing runs it, and it is not done; or the process that ran it ended without saying so; or a
+            job may run it, of a cluster that only the sweep's record names, and that would be shown Ray's token.
         SpecError: The job that was to run it found its arguments wrong.
     """
     from tune_jobs.sweeps.sources import find_sweep
@@ -62,6 +63,8 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
     go_on = resume_command(store, record)
     if record.job is not None and job is not None and job.has_ended and not ran(job):
         raise failure_of(store, record.job, job)
+    if record.state in ("created", "running"):
+        _refuse_if_not_asked(store, record)
     if record.state == "created":
         raise CannotRunError(f"Sweep {store.name} has not begun, and nothing runs it.", f"Run it with `{go_on}`.")
     if record.state == "running":
@@ -70,6 +73,18 @@ def attach(sweep: str | Path, *, storage: str | Path | None = None, progress: st
             f"What is done is kept; continue with `{go_on}`.",
         )
     return _result(store, record, job)
+
+
+def _refuse_if_not_asked(store: Sweep, record: SweepRecord) -> None:
+    """Refuse to say that nothing runs a sweep where a job may, of a cluster that is not asked.
+
+    Raises:
+        CannotRunError: Only the record names that cluster.
+    """
+    job = job_of(record, store.place)
+    refused = None if job is None else why_not_asked(job)
+    if refused is not None:
+        raise refused.again(f"No process runs sweep {store.name} now. {refused.message}")
 
 
 def _follow(store: Sweep, progress: str) -> Job | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import shlex
 import time
@@ -16,12 +17,13 @@ from policies.errors import CannotRunError, NotFoundError, SpecError, TuneJobsEr
 from policies.guard.guard import guarding
 from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
-from tune_jobs.ray_tune.jobs import Job, JobsApi, JobState, check_jobs_address
+from tune_jobs.ray_tune import known_clusters
+from tune_jobs.ray_tune.jobs import Job, JobsApi, JobState, check_jobs_address, token_of
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.sweeps.create import remove_unless_it_waited, removed_if_not_begun, write_created
-from tune_jobs.sweeps.own_job import environment_of, job_of, version_here
+from tune_jobs.sweeps.own_job import environment_of, job_of, own_job_address, version_here
 from tune_jobs.sweeps.storage import stem_of, storage_place
 from tune_jobs.sweeps.travel import folder_to_send, packed
 
@@ -125,7 +127,7 @@ def go_on_detached(
     if store.is_driven():
         raise CannotRunError(f"Sweep {store.name} is being run by another process.", watch)
     known = job_of(record, store.place)
-    before = None if known is None else job_now(known)
+    before = None if known is None else job_now(known, named=(address,))
     if known is not None and before is not None and not before.has_ended:
         raise CannotRunError(f"Job {known.id} at {known.address} is about to run sweep {store.name}.", watch)
     content = _modules_of_sweep(record.allowed_modules, None)
@@ -167,11 +169,42 @@ def wait_until_begun(detached: DetachedSweep, *, timeout_s: float = _BEGIN_S) ->
             time.sleep(_POLL_S)
 
 
-def job_now(job: JobRecord, *, timeout_s: float = _ASK_S) -> Job | None:
-    """Return what becomes of a job; None: its cluster can't be asked just now, or has forgotten it."""
-    with contextlib.suppress(TuneJobsError), JobsApi(job.address, timeout_s=timeout_s) as api:
+def job_now(job: JobRecord, *, timeout_s: float = _ASK_S, named: Sequence[str] = ()) -> Job | None:
+    """Return what becomes of a job; None: its cluster can't or won't be asked just now, or has forgotten it.
+
+    Args:
+        job: As a sweep's record has it.
+        timeout_s: How long an answer may take.
+        named: Addresses that the user has named in this call.
+    """
+    with contextlib.suppress(TuneJobsError), _api_of(job, named, timeout_s=timeout_s) as api:
         return api.job(job.id)
     return None
+
+
+def why_not_asked(job: JobRecord, named: Sequence[str] = ()) -> CannotRunError | None:
+    """Return why a job's cluster is not asked: it would be shown Ray's token, and only a record names its address."""
+    with contextlib.suppress(TuneJobsError):
+        address = check_jobs_address(job.address)
+        if token_of(os.environ) is not None and not known_clusters.is_named(address, (*named, own_job_address())):
+            return CannotRunError(
+                f"Only the sweep's record names {address}, so Ray's token is not sent there, and what becomes of job "
+                f"{job.id} is not known.",
+                f"If that is your cluster, set RAY_API_SERVER_ADDRESS={shlex.quote(address)}.",
+            )
+    return None
+
+
+def _api_of(job: JobRecord, named: Sequence[str] = (), **options: float) -> JobsApi:
+    """Return the Jobs API that a record names; whoever wrote that may be anybody.
+
+    Raises:
+        CannotRunError: It would be shown Ray's token, and the user has not named it.
+    """
+    refused = why_not_asked(job, named)
+    if refused is not None:
+        raise refused
+    return JobsApi(job.address, **options)
 
 
 def ran(job: Job) -> bool:
@@ -201,12 +234,21 @@ def failure_of(store: Sweep, job: JobRecord, found: Job) -> TuneJobsError:
 
 
 def cancel_waiting(store: Sweep) -> bool:
-    """End the job that is to run a sweep and has not begun with it; return whether there was one."""
+    """End the job that is to run a sweep and has not begun with it; return whether there was one.
+
+    Raises:
+        CannotRunError: Its cluster is not asked, see `why_not_asked`, or refuses to end it.
+    """
     job = job_of(store.read_record(), store.place)
-    found = None if job is None else job_now(job)
-    if job is None or found is None or found.has_ended:
+    if job is None:
         return False
-    with JobsApi(job.address) as api:
+    refused = why_not_asked(job)
+    if refused is not None:
+        raise refused
+    found = job_now(job)
+    if found is None or found.has_ended:
+        return False
+    with _api_of(job) as api:
         return api.stop(job.id)
 
 
@@ -264,6 +306,8 @@ def _submit(
     api.submit(
         job.id, shlex.join(words), runtime_env, {"sweep": store.name, "tune_jobs_version": version_here()}
     )  # fmt: skip
+    if api.shows_token:
+        known_clusters.note(api.address)
 
 
 def _forget(store: Sweep) -> None:

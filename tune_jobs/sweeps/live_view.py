@@ -16,7 +16,9 @@ from rich.spinner import Spinner
 from rich.text import Text
 
 from analysis.wording import duration
+from policies.errors import fit
 from tune_jobs.process.streams import patient_stream, quiet
+from tune_jobs.sweeps.fitting_console import FittingConsole
 from tune_jobs.sweeps.live_table import render, summary_line
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.notebook_view import WIDTH, NotebookView, kernel_shell
@@ -60,7 +62,7 @@ class _Lines:
             self._print()
 
     def _print(self) -> None:
-        print(self._line(), file=self._stream, flush=True)
+        print(fit(self._line()), file=self._stream, flush=True)
 
 
 class _Screen:
@@ -86,7 +88,7 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
     with quiet(log) as stream:
         if progress != "none":
             for note in notes:
-                print(f"note: {note}", file=stream, flush=True)
+                print(fit(f"note: {note}"), file=stream, flush=True)
         with contextlib.ExitStack() as stack:
             if progress != "none":
                 stack.enter_context(_view(monitor, stream))
@@ -99,7 +101,7 @@ def _view(monitor: SweepMonitor, stream: IO[str]) -> AbstractContextManager[obje
     if kernel_shell() is not None:
         return NotebookView(monitor.name, lambda: render(monitor, WIDTH), is_line=False)
     if stream.isatty() and not _shares_terminal:
-        return Live(_Screen(monitor), console=Console(file=stream), refresh_per_second=_REFRESH_PER_S)
+        return Live(_Screen(monitor), console=FittingConsole(file=stream), refresh_per_second=_REFRESH_PER_S)
     return _Lines(lambda: summary_line(monitor), stream, at_the_end=True)
 
 
@@ -137,7 +139,7 @@ def working(name: str, what: str, progress: str) -> Iterator[Say]:
     # Unlike `shown`, this leaves the streams alone: warnings of libraries are seen.
     with patient_stream() as stream:
         if stream.isatty() and not _shares_terminal:
-            with Live(spinner, console=Console(file=stream), refresh_per_second=_REFRESH_PER_S, transient=True):
+            with Live(spinner, console=FittingConsole(file=stream), refresh_per_second=_REFRESH_PER_S, transient=True):
                 yield say
         else:
             with _Lines(line, stream, at_the_end=False):

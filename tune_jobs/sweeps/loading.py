@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from policies.acting import load
 from policies.arguments import checked
 from policies.errors import NotFoundError
+from policies.files import expanded
 from tune_jobs.store.urls import is_url
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ def load_policy(path: str | Path) -> Policy:
 
     Args:
         path: `policy.json`, `policy.safetensors`, or the folder that holds them; or the folder of a sweep, or its URL
-            in an object store, of which it is the best policy.
+            in an object store, of which it is the best policy. A ~ at the beginning is a home folder.
 
     Raises:
         NotFoundError: There is no such file, or the sweep has no best policy yet.
@@ -34,7 +35,7 @@ def load_policy(path: str | Path) -> Policy:
         try:
             return load.load_policy(path)
         except NotFoundError:
-            if not _is_sweep(Path(path)):
+            if not _is_sweep(expanded(path)):
                 raise
     from tune_jobs.sweeps.sources import find_sweep
 

@@ -60,16 +60,29 @@ def note_own_job(store: Sweep) -> None:
         store.write_record(record.model_copy(update={"job": job}))
 
 
+def own_job_address() -> str:
+    """Return the address of the cluster that runs this process as a job, as who asked for it named it; empty: none."""
+    job, _ = _told()
+    return "" if job is None else job.address
+
+
 def _own_job() -> JobRecord | None:
-    try:
-        told = json.loads(os.environ.get(_VARIABLE) or "null")
-        job = None if told is None else JobRecord(id=told["id"], address=told["address"], place=told.get("place", ""))
-    except (ValueError, TypeError, KeyError):
-        # Somebody else's variable: this process is driven by nobody's job.
-        return None
-    if job is not None and told.get("version") != version_here():
+    job, version_there = _told()
+    if job is not None and version_there != version_here():
         raise CannotRunError(
-            f"The cluster's head has tune-jobs {version_here()}, and this sweep was sent by {told.get('version')}.",
+            f"The cluster's head has tune-jobs {version_here()}, and this sweep was sent by {version_there}.",
             "Install the same version everywhere.",
         )
     return job
+
+
+def _told() -> tuple[JobRecord | None, object]:
+    """Return the job of this process, and the version of tune-jobs that asked for it."""
+    try:
+        told = json.loads(os.environ.get(_VARIABLE) or "null")
+        if told is None:
+            return None, None
+        return JobRecord(id=told["id"], address=told["address"], place=told.get("place", "")), told.get("version")
+    except (ValueError, TypeError, KeyError, AttributeError):
+        # Somebody else's variable: this process is driven by nobody's job.
+        return None, None

@@ -10,6 +10,7 @@ from urllib.parse import parse_qsl, quote, urlencode
 
 from policies.errors import SpecError
 from policies.files import absolute
+from policies.files import expanded as expanded  # noqa: PLC0414 (for those who know it by this module)
 from tune_jobs.spec.sweep_spec import check_sweep_name, name_after
 from tune_jobs.store.command_names import DEFAULT_STORAGE
 from tune_jobs.store.contract import Sweep
@@ -160,14 +161,6 @@ def local_path(path: str | Path) -> Path:
             f"A URL ({scheme}://) is given for what is written on this machine.", "Give a folder or file of it."
         )
     return expanded(path)
-
-
-def expanded(path: str | Path) -> Path:
-    """Replace a ~ at the beginning of a path by a home folder; the ~ of an unknown user is kept as a name."""
-    try:
-        return Path(path).expanduser()
-    except RuntimeError:
-        return Path(path)
 
 
 def folder_at(place: str) -> Path:

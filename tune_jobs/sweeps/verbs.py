@@ -19,6 +19,7 @@ from policies.guard.guard import guarding
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.plan.user_code import Source, load_source, modules_of
 from tune_jobs.process.interruption import can_drive, current
+from tune_jobs.spec.plain_data import to_plain
 from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.compare import compare
 from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
@@ -283,7 +284,6 @@ def extend(
 
 
 @checked
-@run_alone
 def inject(
     sweep: str | Path,
     point: Mapping[str, Any],
@@ -316,11 +316,13 @@ def inject(
         CannotRunError: Another process or thread runs the sweep, it cannot run here, or Ray died.
         SweepInterrupted: In the same cases as `launch`.
     """
-    from tune_jobs.sweeps.resume import go_on
-    from tune_jobs.sweeps.sources import find_sweep
+    from tune_jobs.sweeps.inject import inject_plain
 
-    store = find_sweep(sweep, storage)
-    return go_on(store, address, point=point, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes)
+    # Another process may run it, which is sent what is plain; what isn't is refused here, in whichever thread.
+    plain = to_plain(point, "point")
+    return inject_plain(
+        sweep, plain, storage=storage, address=address, finish=finish, progress=progress, wait_for_nodes=wait_for_nodes
+    )
 
 
 @checked
@@ -377,6 +379,10 @@ def stop(sweep: str | Path, *, storage: str | Path | None = None) -> bool:
 
     Returns:
         Whether a process runs the sweep, or was about to: a job that has not begun with it is ended.
+
+    Raises:
+        NotFoundError: There is no such sweep.
+        CannotRunError: Only the sweep's record names the cluster of its job, which would be shown Ray's token.
     """
     from tune_jobs.sweeps.sources import find_sweep
 

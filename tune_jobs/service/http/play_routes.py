@@ -8,7 +8,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,9 @@ from fastapi import APIRouter, Query
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from policies.errors import NotFoundError
+from policies.envs.ids import module_of
+from policies.envs.modules import allow_modules, allowed_again, is_allowed
+from policies.errors import NotFoundError, SpecError
 from tune_jobs.service.http.best_policy import has_best, no_best
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.problems import TooManyError
@@ -166,9 +168,29 @@ def _request(
             has = f"it has those of iterations {', '.join(map(str, kept))}" if kept else "it has none yet"
             raise NotFoundError(f"Trial {trial} of sweep {name} has no such checkpoint: {has}.")
         policy = str(sweep.trial(trial).checkpoint_folder(kept[-1] if iteration is None else iteration))
-    modules = sorted({*service.config.modules, *record.allowed_modules})
+    _refuse_other_modules(service, name, [spec.env.id] if random else [spec.env.id, spec.rl_module or ""])
+    # Not those that the record allows: a viewer's token would import what the operator never allowed.
+    modules = list(service.config.modules)
     request = {"policy": policy, "env_id": spec.env.id, "env_args": spec.env.wrapped_args, "modules": modules}
     return request, sweep
+
+
+def _refuse_other_modules(service: Service, name: str, paths: Sequence[str]) -> None:
+    """Refuse what the player would: its answer is about the command line, and its process takes a second to begin.
+
+    Raises:
+        SpecError: A path names a module that the service does not allow.
+    """
+    with allowed_again():
+        allow_modules(service.config.modules)
+        for path in paths:
+            module = module_of(path)
+            if module is not None and not is_allowed(module):
+                raise SpecError(
+                    f"Playing a policy of sweep {name} would import the Python module {module!r}, which this service "
+                    "does not allow.",
+                    f"If you trust it, have the operator start the service with `serve --allow-module {module}`.",
+                )
 
 
 def _event(kind: str, data: Any) -> str:
