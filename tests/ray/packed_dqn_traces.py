@@ -265,8 +265,8 @@ def stored_rows(
     add(stack, "m", 0, **values)
     for _ in range(num_iterations):
         stack.train_iteration()
-    (size,) = stack._replay.sizes(stack._replay.slots(["m"]))
-    rows = stack._replay._rows[0, :size]
+    (slot,) = stack._replay.slots(["m"]).tolist()
+    rows = stack._replay.written(slot)
     stack.envs.close()
     return rows[:, :4], rows[:, 5:9], rows[:, -2], rows[:, -1]
 

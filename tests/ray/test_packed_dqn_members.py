@@ -266,9 +266,8 @@ def stored(
     stack: DQNStack, name: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(observations, next observations, rewards, discounts) of a member."""
-    (slot,) = stack._replay.slots([name])
-    (size,) = stack._replay.sizes(np.array([slot]))
-    rows, num_inputs = stack._replay._rows[slot, :size], stack._num_inputs
+    (slot,) = stack._replay.slots([name]).tolist()
+    rows, num_inputs = stack._replay.written(slot), stack._num_inputs
     return rows[:, :num_inputs], rows[:, num_inputs + 1 : -4], rows[:, -2], rows[:, -1]
 
 

@@ -65,3 +65,45 @@ def test_trees_that_grow_keep_their_leaves_and_one_is_cleared_alone() -> None:
     larger.clear(0)
     assert larger.totals.tolist() == [0, 9, 0]
     check_sums(larger)
+
+
+def test_trees_of_different_sizes_are_each_as_if_alone() -> None:
+    rng, sizes = np.random.default_rng(2), [5, 1000, 2, 64, 1000, 33, 1]
+    together, alone = SumTrees(len(sizes), sizes), [SumTrees(1, size) for size in sizes]
+    assert len(together.leaves) == 3 * 1024
+    slots = np.arange(len(sizes))[:, None]
+    for _ in range(50):
+        some = rng.permutation(slots)[: rng.integers(1, len(sizes) + 1)]
+        places = rng.integers(0, np.array(sizes)[some], (len(some), 16))
+        values, shares = rng.random(places.shape), rng.random(places.shape)
+        together.set(together.starts[some] + places, values)
+        for row, tree in enumerate(some[:, 0]):
+            alone[tree].set(places[row], values[row])
+        np.testing.assert_array_equal(together.totals, [each.totals[0] for each in alone])
+        np.testing.assert_array_equal(together.totals_of(some[:, 0]), together.totals[some[:, 0]])
+        heights = shares * together.totals[some]
+        found = together.find(some, heights)
+        np.testing.assert_array_equal(found, together.find(np.broadcast_to(some, heights.shape), heights))
+        for row, tree in enumerate(some[:, 0]):
+            expected = alone[tree].find(np.zeros(16, dtype=np.int64), heights[row])
+            np.testing.assert_array_equal(found[row] - together.starts[tree], expected)
+
+
+def test_trees_of_different_sizes_keep_their_leaves_when_others_come_or_grow() -> None:
+    trees = SumTrees(3, [3, 20, 1])
+    leaves = [np.array([1.0, 2.0, 3.0]), np.arange(20.0), np.array([7.0]), np.zeros(0)]
+    for tree, values in enumerate(leaves[:3]):
+        trees.set(trees.starts[tree] + np.arange(len(values)), values)
+    for sizes in ([3, 20, 1, 200], [50, 20, 1], [3, 100, 40], [3, 20, 1]):
+        other = trees.resized(len(sizes), sizes)
+        np.testing.assert_array_equal(other.totals, [6, 190, 7, 0][: len(sizes)])
+        for tree, (values, size) in enumerate(zip(leaves, sizes, strict=False)):
+            assert other.has_size(tree, size)
+            found = other.leaves[other.starts[tree] :][:size]
+            np.testing.assert_array_equal(found[: len(values)], values)
+            assert not found[len(values) :].any()
+        other.clear(1)
+        np.testing.assert_array_equal(other.totals, [6, 0, 7, 0][: len(sizes)])
+        assert other.leaves.sum() == 13
+    assert not trees.has_size(0, 5)
+    np.testing.assert_array_equal(trees.resized(3, [3, 2, 1]).totals, [6, 1, 7])

@@ -1,8 +1,8 @@
 """Replay memories of many members in one array, so that one gather serves them all.
 
 They are the memories of `policies.replay`, where the words are explained. Shapes: M members (of a call), K new
-transitions, B rows per batch, D numbers per observation. A member's rows are its *slot*, which it keeps until
-it leaves.
+transitions, B rows per batch, D numbers per observation. A member has a *slot*, which it keeps until it leaves, and in
+it as many neighbouring rows as its own memory holds, whose numbers are the *places* of its transitions.
 
 Columns of a row: observation, next observation, each as `policies.packed.inputs.Inputs` puts it into columns (with a 1
 after it, or four bytes of an image in each), then action, reward, discount.
@@ -52,33 +52,63 @@ class StackedReplay:
     def __init__(self, shared: SharedByDQN, seen: Inputs) -> None:
         self._newest_only = shared.replay == "none"
         self.num_columns = 2 * seen.num_columns + 3
-        self._rows: Floats = np.empty((0, 0, self.num_columns), dtype=np.float32)
+        self._rows: Floats = np.empty((0, self.num_columns), dtype=np.float32)
         self._slots: dict[str, int] = {}
+        # The first row of each slot.
+        self._start: Indices = np.zeros(0, dtype=np.int64)
         self._capacity: Indices = np.zeros(0, dtype=np.int64)
         self._next: Indices = np.zeros(0, dtype=np.int64)
         self._size: Indices = np.zeros(0, dtype=np.int64)
 
     def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
-        """Make room for a member's transitions."""
-        capacity = hyperparams.train_batch_size if self._newest_only else hyperparams.replay_capacity
-        slot = min(set(range(len(self._slots) + 1)) - set(self._slots.values()))
-        self._grow(slot + 1, capacity)
+        """Make room for a member's transitions, as many as its own memory holds."""
+        slot, capacity = self._free_slot(), self._capacity_of(hyperparams)
+        start = self._free_rows(capacity)
+        if slot == len(self._start):
+            for name in ("_start", "_capacity", "_next", "_size"):
+                setattr(self, name, np.append(getattr(self, name), 0))
         self._slots[member_id] = slot
-        self._capacity[slot], self._next[slot], self._size[slot] = capacity, 0, 0
+        self._start[slot], self._capacity[slot], self._next[slot], self._size[slot] = start, capacity, 0, 0
 
-    def _grow(self, num_slots: int, capacity: int) -> None:
-        num_now, capacity_now = self._rows.shape[:2]
-        if num_slots <= num_now and capacity <= capacity_now:
-            return
-        # Left uninitialised: the operating system provides memory only for the rows that are written.
-        larger = np.empty((max(num_slots, num_now), max(capacity, capacity_now), self.num_columns), dtype=np.float32)
-        for slot in self._slots.values():
-            larger[slot, : self._size[slot]] = self._rows[slot, : self._size[slot]]
-        self._rows = larger
-        for name in ("_capacity", "_next", "_size"):
-            values = np.zeros(len(larger), dtype=np.int64)
-            values[:num_now] = getattr(self, name)
-            setattr(self, name, values)
+    def _capacity_of(self, hyperparams: DQNHyperparams) -> int:
+        return hyperparams.train_batch_size if self._newest_only else hyperparams.replay_capacity
+
+    def _free_slot(self) -> int:
+        return min(set(range(len(self._slots) + 1)) - set(self._slots.values()))
+
+    def _free_rows(self, capacity: int) -> int:
+        """Return the first of so many neighbouring rows that are no member's; make room for them if there are none."""
+        slots = sorted(self._slots.values(), key=lambda slot: int(self._start[slot]))
+        end = 0
+        for slot in slots:
+            if self._start[slot] - end >= capacity:
+                return end
+            end = int(self._start[slot] + self._capacity[slot])
+        if len(self._rows) - end >= capacity:
+            return end
+        taken = int(self._capacity[slots].sum())
+        rows = self._rows
+        if len(rows) < taken + capacity:
+            # Left uninitialised: the operating system provides memory only for the rows that are written.
+            rows = np.empty((taken + capacity, self.num_columns), dtype=np.float32)
+        self._move(slots, rows)
+        return taken
+
+    def _move(self, slots: Sequence[int], rows: Floats) -> None:
+        """Move members' rows to the beginning of an array, which may be the one that they are in, one after another.
+
+        Args:
+            slots: The slots of all members, in the order of their rows.
+            rows: The array.
+        """
+        start = 0
+        for slot in slots:
+            # As one line of numbers, of which no copy is made first where they move within the array.
+            written = self.written(slot).reshape(-1)
+            rows.reshape(-1)[start * self.num_columns :][: len(written)] = written
+            self._start[slot] = start
+            start += int(self._capacity[slot])
+        self._rows = rows
 
     def remove_member(self, member_id: str) -> None:
         """Forget a member's transitions."""
@@ -92,6 +122,11 @@ class StackedReplay:
         """Return the number of transitions in each slot, (M,)."""
         return self._size[slots]
 
+    def written(self, slot: int) -> Floats:
+        """Return the transitions in a slot, (size, columns), in the order of their places."""
+        start = int(self._start[slot])
+        return self._rows[start : start + int(self._size[slot])]
+
     def add(self, slots: Indices, rows: Floats) -> None:
         """Append K rows to each of some slots; if more are given than fit, the newest stay.
 
@@ -100,20 +135,20 @@ class StackedReplay:
             rows: The new rows, (M, K, columns), oldest first.
         """
         num_new = rows.shape[1]
-        places = (self._next[slots, None] + np.arange(num_new)) % self._capacity[slots, None]
-        smallest = int(self._capacity[slots].min())
-        if num_new > smallest:
+        capacity = self._capacity.take(slots)
+        places = (self._next.take(slots)[:, None] + np.arange(num_new)) % capacity[:, None]
+        if num_new > int(capacity.min()):
             for slot, new in zip(slots.tolist(), rows, strict=True):
                 self._add_one(slot, new)
             return
-        self._rows[slots[:, None], places] = rows
+        self._rows[self._start.take(slots)[:, None] + places] = rows
         self._advance(slots, places)
 
     def _add_one(self, slot: int, rows: Floats) -> None:
         capacity = int(self._capacity[slot])
         rows = rows[max(0, len(rows) - capacity) :]
         places = (self._next[slot] + np.arange(len(rows))) % capacity
-        self._rows[slot, places] = rows
+        self._rows[self._start[slot] + places] = rows
         self._advance(np.array([slot]), places[None])
 
     def _advance(self, slots: Indices, places: Indices) -> None:
@@ -131,16 +166,16 @@ class StackedReplay:
         """
         if self._newest_only:
             num_rows = numbers.shape[-1]
-            newest = (self._next[slots, None] - num_rows + np.arange(num_rows)) % self._capacity[slots, None]
+            first = self._next.take(slots)[:, None] - num_rows
+            newest = (first + np.arange(num_rows)) % self._capacity.take(slots)[:, None]
             places = np.broadcast_to(newest, numbers.shape)
         else:
-            places = (numbers * self._size[slots, None]).astype(np.int64)
+            places = (numbers * self._size.take(slots)[:, None]).astype(np.int64)
         return Drawn(self._gather(slots, places))
 
     def _gather(self, slots: Indices, places: Indices) -> Floats:
-        flat = self._rows.reshape(-1, self.num_columns)
-        indices = places + slots[:, None] * self._rows.shape[1]
-        rows: Floats = flat.take(indices.reshape(-1), axis=0).reshape(*places.shape, self.num_columns)
+        indices = places + self._start.take(slots)[:, None]
+        rows: Floats = self._rows.take(indices.reshape(-1), axis=0).reshape(*places.shape, self.num_columns)
         return rows
 
     def set_priorities(self, slots: Indices, indices: Indices, td_errors: Floats) -> None:
@@ -163,28 +198,33 @@ class StackedPrioritizedReplay(StackedReplay):
 
     @override
     def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
+        # Before anything else is changed, as there may be too little memory for it.
+        self._make_tree(self._free_slot(), self._capacity_of(hyperparams))
         super().add_member(member_id, hyperparams)
-        self._grow_trees()
         slot = self._slots[member_id]
-        self._priorities.clear(slot)
+        if slot == len(self._highest):
+            for name in ("_highest", "_alpha", "_beta", "_epsilon"):
+                setattr(self, name, np.append(getattr(self, name), 0.0))
         self._highest[slot] = 1.0
         self._alpha[slot], self._beta[slot] = hyperparams.prioritized_alpha, hyperparams.prioritized_beta
         self._epsilon[slot] = hyperparams.prioritized_epsilon
 
-    def _grow_trees(self) -> None:
-        num_slots, capacity = self._rows.shape[:2]
-        num_now = len(self._highest)
-        if num_slots == num_now and capacity <= self._priorities.num_leaves:
-            return
-        self._priorities = self._priorities.resized(num_slots, capacity)
-        for name in ("_highest", "_alpha", "_beta", "_epsilon"):
-            values = np.zeros(num_slots)
-            values[:num_now] = getattr(self, name)
-            setattr(self, name, values)
+    def _make_tree(self, slot: int, capacity: int) -> None:
+        """Give a slot that is free a tree for a new member."""
+        if slot < len(self._priorities.starts):
+            self._priorities.clear(slot)
+            if self._priorities.has_size(slot, capacity):
+                return
+        # None for other slots that are free.
+        capacities = [0] * max(slot + 1, len(self._capacity))
+        for taken in self._slots.values():
+            capacities[taken] = int(self._capacity[taken])
+        capacities[slot] = capacity
+        self._priorities = self._priorities.resized(len(capacities), capacities)
 
     def _first(self, slots: Indices) -> Indices:
         """Return where the leaves of slots begin, (M, 1)."""
-        return slots[:, None] * self._priorities.num_leaves
+        return self._priorities.starts.take(slots)[:, None]
 
     def _advance(self, slots: Indices, places: Indices) -> None:
         super()._advance(slots, places)
@@ -192,12 +232,12 @@ class StackedPrioritizedReplay(StackedReplay):
 
     @override
     def draw(self, slots: Indices, numbers: NDArray[np.float64]) -> Drawn:
-        totals = self._priorities.totals[slots][:, None]
+        totals, sizes = self._priorities.totals_of(slots)[:, None], self._size.take(slots)[:, None]
         first = self._first(slots)
-        found = self._priorities.find(np.broadcast_to(slots[:, None], numbers.shape), numbers * totals)
-        places = np.minimum(found - first, self._size[slots, None] - 1)
+        found = self._priorities.find(slots[:, None], numbers * totals)
+        places = np.minimum(found - first, sizes - 1)
         shares = self._priorities.leaves[first + places] / totals
-        weights = (self._size[slots, None] * shares) ** -self._beta[slots, None]
+        weights = (sizes * shares) ** -self._beta.take(slots)[:, None]
         weights = (weights / weights.max(axis=1, keepdims=True)).astype(np.float32)
         return Drawn(self._gather(slots, places), weights, places)
 
