@@ -20,15 +20,20 @@ _MEANS: dict[Objective, str] = {
 
 
 def setting_score(settings: SettingsRecord) -> str:
-    """Return what the leading setting scored, with its interval over training seeds and how many solved the env."""
+    """Return what the leading setting scored, with its interval over training seeds and how many solved the env.
+
+    Where less is to be expected of more seeds, that is said: the best of many settings led with its seeds' luck too.
+    """
     best = settings.best
     # Fewer env steps are better, so that they are scored below zero.
     sign = -1.0 if settings.objective == "steps_to_threshold" else 1.0
-    parts = [f"{return_text(best.score) if sign > 0 else _steps_text(-best.score)} {_MEANS[settings.objective]}"]
+    parts = [f"{_score_text(settings, best.score)} {_MEANS[settings.objective]}"]
     if best.lower is not None and best.upper is not None:
         low, high = sorted((sign * best.lower, sign * best.upper))
         ends = range_text(low, high) if sign > 0 else f"{_steps_text(low)} to {_steps_text(high)}"
         parts[0] += f" ({ends} with 95 %, over training seeds)"
+    if less := less_expected(settings):
+        parts.append(less)
     if best.num_solved is not None:
         parts.append(f"{best.num_solved} of {counted(len(best.scores), 'seed')} solved it in training")
     if best.num_failed:
@@ -36,11 +41,30 @@ def setting_score(settings: SettingsRecord) -> str:
     return "; ".join(parts)
 
 
+def less_expected(settings: SettingsRecord) -> str:
+    """Say what is to be expected of more seeds of the leading setting, if that is less than its score; else empty."""
+    best = settings.best
+    score, expected = (_score_text(settings, value) for value in (best.score, best.expected))
+    if best.expected >= best.score or expected == score:
+        return ""
+    return f"{expected} is to be expected of more seeds"
+
+
+def why_unsure(settings: SettingsRecord) -> str:
+    """Return why nothing is known of how much seeds differ, where the leading setting has no interval."""
+    seeds = [item.scores for item in settings.ranking]
+    if max(map(len, seeds)) < 2:
+        return "one seed a setting names a good policy, not a good setting"
+    if any(len(set(scores)) > 1 for scores in seeds):
+        return "scores are too large to be squared, so it is not known how much seeds differ"
+    return "no two seeds of a setting differ, so it is not known how much they may"
+
+
 def certainty(settings: SettingsRecord) -> str:
     """Return how sure it is that the leading setting is the best."""
     best = settings.best
     if best.probability_best is None:
-        return "one seed a setting names a good policy, not a good setting: see `tune-jobs replicate`"
+        return f"{why_unsure(settings)}: see `tune-jobs replicate`"
     text = f"the best of {settings.num_settings:,} with a probability of {_percent(best.probability_best)}"
     others = settings.num_may_be_best - 1
     if others <= 0:
@@ -97,6 +121,10 @@ def replicas_text(sweep: SweepRecord, trials: Sequence[TrialRecord]) -> str:
     text = f"{counted(num_added, 'trial')} gave {counted(len(seeds), 'leading setting')} more seeds{share}"
     without = len(seeds) * max(seeds.values())
     return f"{text}; as many for each would take {without}" if without > num_added else text
+
+
+def _score_text(settings: SettingsRecord, score: float) -> str:
+    return _steps_text(-score) if settings.objective == "steps_to_threshold" else return_text(score)
 
 
 def _steps_text(steps: float) -> str:

@@ -51,13 +51,13 @@ class SettingRecord(Record):
     point: dict[str, Any]
     trial_ids: tuple[TrialId, ...] = Field(description="The trials it was trained in, one a training seed.")
     scores: tuple[Number, ...] = Field(description="The objective's value of each of them, higher is better.")
-    num_failed: Count = Field(description="How many of them failed; their scores are the worst of the sweep.")
+    num_failed: Count = Field(description="How many of them failed, which count as the worst of the sweep or worse.")
     num_solved: Count | None = Field(None, description="How many reached the threshold; None: the env has none.")
     score: Number = Field(description="Mean of the scores.")
     expected: Number = Field(description="What it is expected to be over many seeds, by which settings are ranked.")
-    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: one seed a setting.")
+    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: no two seeds differ.")
     upper: float | None = None
-    probability_best: float | None = Field(None, description="That no other is better; None: one seed a setting.")
+    probability_best: float | None = Field(None, description="That no other is better; None: no two seeds differ.")
     may_be_best: bool = Field(default=True, description="Whether the data can't tell it from the best.")
 
 
@@ -71,7 +71,7 @@ class FrontPointRecord(Record):
     score: Number = Field(description="Mean of the objective over its seeds, higher is better.")
     expected: Number = Field(description="What it is expected to be over many seeds, by which the front is found.")
     num_env_steps: Number = Field(description="Its cost: the mean env steps of a training with it.")
-    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: one seed a setting.")
+    lower: float | None = Field(None, description="The 95 % interval over training seeds; None: no two seeds differ.")
     upper: float | None = None
 
 
@@ -84,14 +84,14 @@ class FrontRecord(Record):
     undecided: tuple[FrontPointRecord, ...] = Field(
         (), description="Others that the data can't tell from being on it, the cheapest ones."
     )
-    num_undecided: Count | None = Field(None, description="How many these are; None: one seed a setting.")
+    num_undecided: Count | None = Field(None, description="How many these are; None: no two seeds differ.")
     cheapest_near: FrontPointRecord = Field(description="The cheapest setting near the best.")
     best_env_steps: float | None = Field(None, description="What the best one costs; None: a former record.")
     near_share: Number = Field(description="The share of what the best gained that one near it loses at most.")
     untrained: float | None = Field(None, description="The return that gains are counted from; None: it is not known.")
     near_score: Number = Field(description="The least expected score that is near the best.")
     may_be_best: bool | None = Field(
-        None, description="Whether the data can't tell `cheapest_near` from the best; None: one seed a setting."
+        None, description="Whether the data can't tell `cheapest_near` from the best; None: no two seeds differ."
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from analysis.best_records import FrontPointRecord, FrontRecord
 from analysis.objectives import SettingScores
 from analysis.records import IterationRecord
-from analysis.statistics import seed_intervals, tie_groups
+from analysis.statistics import known_intervals, tell_the_best, tie_groups
 from policies import random_streams
 
 NEAR = 0.05
@@ -143,14 +143,15 @@ def _non_dominated(ranking: Sequence[SettingScores], order: Sequence[int]) -> li
 def _certainty(
     ranking: Sequence[SettingScores], order: Sequence[int]
 ) -> tuple[list[tuple[float | None, float | None]], set[int] | None, set[int] | None]:
-    """Return the interval of each setting, who may be on the front, and who may be the best; None: one seed each."""
+    """Return the interval of each setting, who may be on the front, and who may be the best; None: nothing says so."""
     unknown: list[tuple[float | None, float | None]] = [(None, None)] * len(ranking)
     scores = [item.scores for item in ranking]
     if max(map(len, scores)) < 2:
         return unknown, None, None
     try:
+        if not tell_the_best(scores):
+            return unknown, None, None
         ties = tie_groups(scores, rng=random_streams.fixed())
-        intervals = [(item.lower, item.upper) for item in seed_intervals(scores)]
     except ValueError:  # scores so large that their squares are not finite
         return unknown, None, None
     may_be, bar = set(), -math.inf
@@ -163,4 +164,7 @@ def _certainty(
             bar = max(bar, *(float(lower[other]) for other in same))
         if upper[index] >= bar:
             may_be.add(index)
-    return list(intervals), may_be, set(ties.with_leader)
+    intervals: list[tuple[float | None, float | None]] = [
+        (None, None) if item is None else (item.lower, item.upper) for item in known_intervals(scores)
+    ]
+    return intervals, may_be, set(ties.with_leader)

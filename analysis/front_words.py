@@ -89,7 +89,9 @@ def near_text(front: FrontRecord) -> str:
 def undecided_text(front: FrontRecord) -> str:
     """Say how sure it is who is on the front."""
     if front.num_undecided is None:
-        return "Each setting has one seed: nothing says how sure it is who is on the front."
+        several = any(item.num_seeds > 1 for item in front.points)
+        why = "It is not known how much seeds differ" if several else "Each setting has one seed"
+        return f"{why}: nothing says how sure it is who is on the front."
     if not front.num_undecided:
         return "The data tell all other settings from those on the front."
     text = f"{counted(front.num_undecided, 'other setting')} can't be told from being on the front"

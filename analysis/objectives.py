@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,7 @@ class SettingScores:
     point_index: int
     point: dict[str, Any]
     scores: tuple[float, ...]
-    """One a training seed, higher is better; a seed that failed has the worst score of the sweep."""
+    """One a training seed, higher is better; what a seed that failed counts as is said at `failed_score`."""
     trial_ids: tuple[str, ...]
     """The trials, in the order of the scores."""
     num_failed: int
@@ -64,13 +64,15 @@ def rank_settings(
     *,
     num_env_steps: int,
     threshold: float | None = None,
+    worst: float | None = None,
 ) -> list[SettingScores]:
     """Return the settings of a sweep, the one with the best expected mean first.
 
     Of equal ones, first come those with fewer trials that failed or have no score, then those of lower index.
 
     Trials that have not ended are left out, and so are settings that have no others. A trial that failed, or ended
-    without any whole episode, counts as the worst of all: to leave it out would raise the mean of its setting.
+    without any whole episode, counts as the worst of all (`failed_score`): to leave it out would raise the mean of its
+    setting.
 
     Args:
         trials: The trials of one sweep.
@@ -78,6 +80,7 @@ def rank_settings(
         objective: What a trial is judged by.
         num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
         threshold: The return to reach, for `steps_to_threshold`.
+        worst: What a failed trial counts as, where other sweeps are looked at too; None: what this one says.
 
     Raises:
         ValueError: `steps_to_threshold` without a threshold.
@@ -92,7 +95,8 @@ def rank_settings(
     known = {trial_id: score for trial_id, score in shown.items() if score is not None}
     if not known:
         return []
-    worst = min(known.values())
+    if worst is None:
+        worst = failed_score(known.values(), objective, num_env_steps=num_env_steps)
     members: defaultdict[int, list[TrialRecord]] = defaultdict(list)
     for trial in sorted(trials, key=lambda item: item.index):
         if trial.trial_id in shown:
@@ -118,6 +122,25 @@ def rank_settings(
         return -item.expected, -item.mean, item.num_unscored, item.point_index
 
     return sorted(settings, key=order)
+
+
+def failed_score(scores: Iterable[float], objective: Objective, *, num_env_steps: int) -> float:
+    """Return what a training that failed counts as: the worst of all.
+
+    For `steps_to_threshold` that is one that never reaches the threshold, be there one or not: were it the slowest of
+    those that did, to fail would be as good as to reach it.
+
+    Args:
+        scores: The scores that there are, one at least.
+        objective: What they are of.
+        num_env_steps: The env steps that a training has.
+    """
+    worst = min(scores)
+    return min(worst, _never_reached(num_env_steps)) if objective == "steps_to_threshold" else worst
+
+
+def _never_reached(num_env_steps: int) -> float:
+    return -2.0 * num_env_steps
 
 
 def reached_goal(trial: TrialState) -> bool:
@@ -230,8 +253,8 @@ def trial_score(
     if objective == "steps_to_threshold":
         if threshold is None:
             raise ValueError("steps_to_threshold needs a threshold")
-        reached = (steps for steps, value in evaluations if value >= threshold)
-        return -float(next(reached, 2 * num_env_steps)) if iterations else None
+        reached = (-float(steps) for steps, value in evaluations if value >= threshold)
+        return next(reached, _never_reached(num_env_steps)) if iterations else None
     if objective == "final":
         return _final(iterations, evaluations, num_env_steps)
     if not evaluations:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from analysis.objectives import expected_means
-from analysis.statistics import probability_of_being_best
+from analysis.statistics import probability_of_being_best, seeds_differ
 from policies import random_streams
 
 HARDLY_POSSIBLE = 0.02
@@ -76,12 +76,15 @@ class Race:
     def _still_in(self, scores: Mapping[int, Sequence[float]], size: int) -> list[int]:
         known = [scores[index] for index in self.contenders]
         means = dict(zip(self.contenders, expected_means(known), strict=True))
+        all_possible = [1.0] * len(known)
         try:
-            # The same scores decide the same, whenever it is asked.
-            chances = list(probability_of_being_best(known, rng=random_streams.fixed()))
+            # The same scores decide the same, whenever it is asked. Of seeds that do not differ nothing says who cannot
+            # win.
+            rng = random_streams.fixed()
+            chances = list(probability_of_being_best(known, rng=rng)) if seeds_differ(known) else all_possible
         except ValueError:
-            # Of scores so large that their squares are no numbers, nothing says who cannot win.
-            chances = [1.0] * len(known)
+            # Nor does it of scores so large that their squares are no numbers.
+            chances = all_possible
         possible = [index for index, chance in zip(self.contenders, chances, strict=True) if chance >= HARDLY_POSSIBLE]
         return sorted(possible, key=lambda index: -means[index])[:size]
 

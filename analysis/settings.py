@@ -13,7 +13,7 @@ from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.front import front_of, untrained_return
 from analysis.objectives import SettingScores, rank_settings
 from analysis.records import Cost, IterationRecord, Objective, TrialRecord
-from analysis.statistics import probability_of_being_best, seed_intervals, tie_groups
+from analysis.statistics import known_intervals, probability_of_being_best, tell_the_best, tie_groups
 from analysis.tables import env_steps_to
 from policies import random_streams
 
@@ -31,8 +31,8 @@ def judge_settings(
 ) -> SettingsRecord | None:
     """Rank the settings of a sweep; None if no trial has ended with anything to be judged by.
 
-    Intervals, and the probability to be the best, need a setting with two seeds: how much seeds differ is learnt from
-    all of them (`statistics.moderated_means`).
+    Intervals, and the probability to be the best, need a setting with two seeds that differ: how much seeds differ is
+    learnt from all of them (`statistics.moderated_means`).
 
     Args:
         trials: The trials of one sweep.
@@ -80,19 +80,20 @@ def _known(ranking: Sequence[SettingScores]) -> list[dict[str, Any]]:
     # The same scores always give the same answer.
     rng = random_streams.fixed()
     try:
-        intervals = seed_intervals(scores)
+        if not tell_the_best(scores):
+            return [{} for _ in ranking]
         chances = probability_of_being_best(scores, rng=rng)
         leaders = set(tie_groups(scores, rng=rng).with_leader)
     except ValueError:  # scores so large that their squares are not finite
         return [{} for _ in ranking]
     return [
         {
-            "lower": interval.lower,
-            "upper": interval.upper,
+            "lower": interval and interval.lower,
+            "upper": interval and interval.upper,
             "probability_best": float(chances[index]),
             "may_be_best": index in leaders,
         }
-        for index, interval in enumerate(intervals)
+        for index, interval in enumerate(known_intervals(scores))
     ]
 
 

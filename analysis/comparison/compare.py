@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from analysis.comparison.entries import Entry, Wanted, judged_alike, make_entry
 from analysis.comparison.pairs import Pair, make_pair
 from analysis.comparison.repetition import same_numbers
+from analysis.exports.frames import ranked_settings
+from analysis.objectives import failed_score
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
 from analysis.report_data import env_arguments_of, env_of
 from analysis.wording import counted
@@ -33,6 +35,9 @@ class Comparison:
     """Why their scores are on no common scale; empty if they are."""
     notes: tuple[str, ...]
     """What has to be known to read the numbers."""
+    failed_score: float | None = None
+    """What a failed seed counts as, the worst of all that are compared; None: the worst of its sweep, as nothing is on
+    one scale, or there are no scores."""
 
 
 def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Comparison:
@@ -50,15 +55,36 @@ def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Com
         notes.append("They have other thresholds, so it is not said how many seeds solved the environment.")
     chosen, why = (objective, "") if objective else common_objective(wanted)
     notes += [why] if why else []
-    ready = {
-        letter: judged_alike(item, chosen, threshold)
-        for letter, item in zip(string.ascii_uppercase, wanted, strict=False)
-    }
+    named = dict(zip(string.ascii_uppercase, wanted, strict=False))
+    reasons = why_not_comparable([item.sweep for item in wanted], list(named))
+    ready = {letter: judged_alike(item, chosen, threshold) for letter, item in named.items()}
+    failed = None if reasons else _failed_score(list(ready.values()))
+    ready = {letter: judged_alike(item, chosen, threshold, failed) for letter, item in named.items()}
     entries = tuple(make_entry(item, letter, shares_threshold=shares_threshold) for letter, item in ready.items())
-    reasons = why_not_comparable([item.sweep for item in wanted], [entry.letter for entry in entries])
     pairs = () if reasons else tuple(make_pair(one, other, ready) for one, other in _pairs(entries))
     notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries)]
-    return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes))
+    if any(entry.num_failed for entry in entries):
+        notes.append(_told_of_failures(chosen, are_comparable=not reasons))
+    return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes), failed)
+
+
+def _failed_score(wanted: Sequence[Wanted]) -> float | None:
+    """Return what a failed seed of any of them counts as, in all of their sweeps; None: none has scores.
+
+    Were it the worst of its own sweep, one that crashed would be better than those that trained in a worse sweep.
+    """
+    scores = [score for item in wanted for setting in ranked_settings(item.data) for score in setting.scores]
+    if not scores:
+        return None
+    longest = max(item.data.num_env_steps for item in wanted)
+    return failed_score(scores, wanted[0].data.objective, num_env_steps=longest)
+
+
+def _told_of_failures(objective: Objective, *, are_comparable: bool) -> str:
+    if objective == "steps_to_threshold":
+        return "A failed seed counts as a training that never reaches the threshold."
+    of_whom = "all that are compared" if are_comparable else "its sweep"
+    return f"A failed seed counts as the worst training of {of_whom}."
 
 
 def common_objective(wanted: Sequence[Wanted]) -> tuple[Objective, str]:
@@ -139,8 +165,6 @@ def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str
             f"{name} {', '.join(str(known.get(name, 'not recorded')) for known in versions)}" for name in other
         )
         notes.append(f"They ran with different versions: {told}.")
-    if any(entry.num_failed for entry in entries):
-        notes.append("A failed seed counts as the worst trial of its sweep.")
     return notes
 
 

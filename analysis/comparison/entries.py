@@ -13,7 +13,7 @@ from analysis.objectives import SettingScores
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
 from analysis.report_data import env_of
 from analysis.selection import error_summary
-from analysis.statistics import iqm, moderated_means, seed_intervals, steps_to_threshold
+from analysis.statistics import iqm, known_intervals, moderated_means, steps_to_threshold
 from analysis.tables import env_steps_to
 from analysis.wording import counted
 
@@ -49,12 +49,12 @@ class Entry:
     point: dict[str, Any]
     trial_ids: tuple[str, ...]
     scores: tuple[float, ...]
-    """One a training seed, higher is better; a failed seed has the worst score of its sweep."""
+    """One a training seed, higher is better; a failed seed has the worst score of all that are compared."""
     num_failed: int
     num_solved: int | None
     mean: float | None
     lower: float | None
-    """The 95 % interval of the mean over training seeds; None: no setting of the sweep has two seeds."""
+    """The 95 % interval of the mean over training seeds; None: no setting of the sweep has two seeds that differ."""
     upper: float | None
     iqm: float | None
     standard_error: float | None
@@ -82,9 +82,19 @@ class Entry:
     """Whether the sweep runs, so that `wall_s` is of what was before this run."""
 
 
-def judged_alike(wanted: Wanted, objective: Objective, threshold: float | None) -> Wanted:
-    """Return what is compared, judged by this objective and solved at this return."""
-    return replace(wanted, data=replace(wanted.data, objective=objective, threshold=threshold))
+def judged_alike(
+    wanted: Wanted, objective: Objective, threshold: float | None, failed_score: float | None = None
+) -> Wanted:
+    """Return what is compared, judged by this objective and solved at this return.
+
+    Args:
+        wanted: What is compared.
+        objective: What it is judged by.
+        threshold: The return that solves the env.
+        failed_score: What a failed seed counts as; None: what its sweep by itself says.
+    """
+    data = replace(wanted.data, objective=objective, threshold=threshold, failed_score=failed_score)
+    return replace(wanted, data=data)
 
 
 def make_entry(wanted: Wanted, letter: str, *, shares_threshold: bool = True) -> Entry:
@@ -144,9 +154,13 @@ def _trials_of(wanted: Wanted) -> list[TrialRecord]:
 
 
 def _chosen(wanted: Wanted, ranking: Sequence[SettingScores]) -> SettingScores | None:
-    if wanted.point_index is None:
-        return next(iter(ranking), None)
-    return next((item for item in ranking if item.point_index == wanted.point_index), None)
+    index = wanted.point_index
+    if index is None:
+        # The setting that the sweep names by itself, whatever the others' worst is.
+        has_failures = any(item.num_unscored for item in ranking)
+        own = ranked_settings(replace(wanted.data, failed_score=None)) if has_failures else ranking
+        index = own[0].point_index if own else None
+    return next((item for item in ranking if item.point_index == index), None)
 
 
 def why_no_scores(wanted: Wanted, *, shares_threshold: bool = True) -> str:
@@ -176,13 +190,13 @@ def _scored(chosen: SettingScores, ranking: Sequence[SettingScores]) -> dict[str
     if max(map(len, scores)) < 2:
         return found
     try:
-        interval, fit = seed_intervals(scores)[index], moderated_means(scores)
+        interval, fit = known_intervals(scores)[index], moderated_means(scores)
     except ValueError:  # so large that their squares are not finite
         return found
     return {
         **found,
-        "lower": interval.lower,
-        "upper": interval.upper,
+        "lower": interval and interval.lower,
+        "upper": interval and interval.upper,
         "standard_error": float(fit.standard_errors[index]),
         "df": float(fit.dfs[index]),
         "sweep_df": float(fit.num_seeds.sum() - fit.num_seeds.size),

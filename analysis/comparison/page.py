@@ -66,7 +66,7 @@ def write_page(path: Path, comparison: Comparison, wanted: Mapping[str, Wanted])
     from markupsafe import Markup
 
     ready = {
-        entry.letter: judged_alike(wanted[entry.letter], comparison.objective, entry.threshold)
+        entry.letter: judged_alike(wanted[entry.letter], comparison.objective, entry.threshold, comparison.failed_score)
         for entry in comparison.entries
     }
     page = (

@@ -29,9 +29,12 @@ class Shared:
 
     num_settings: int
     probability: Estimate
-    """P(a training of the left sweep scores more than one of the right, with the same setting)."""
+    """P(a training of the left sweep scores more than one of the right, with the same setting), of all trainings."""
     left_iqm: Estimate
-    """Interquartile mean of all trainings with these settings; its ends are NaN where each has one seed."""
+    """Interquartile mean of trainings with these settings; its ends are NaN where each has one seed.
+
+    Of each setting those seeds count that came first, as many as both sweeps have: a sweep that gave its leading
+    settings more seeds is not the better for it."""
     right_iqm: Estimate
 
 
@@ -171,11 +174,12 @@ def _shared(left: Wanted, right: Wanted, level: float) -> tuple[Shared | None, s
         )
         return None, f"{why}, so only the leading ones are compared"
     left_scores, right_scores = [ours[key] for key in common], [theirs[key] for key in common]
+    both = [min(len(left), len(right)) for left, right in zip(left_scores, right_scores, strict=True)]
     return Shared(
         num_settings=len(common),
         probability=probability_of_improvement(left_scores, right_scores, level=level),
-        left_iqm=_iqm(left_scores, level),
-        right_iqm=_iqm(right_scores, level),
+        left_iqm=_iqm([scores[:count] for scores, count in zip(left_scores, both, strict=True)], level),
+        right_iqm=_iqm([scores[:count] for scores, count in zip(right_scores, both, strict=True)], level),
     ), ""
 
 
@@ -220,10 +224,13 @@ def _unsearched(sweep: SweepRecord) -> dict[str, Any]:
 def _by_meaning(wanted: Wanted) -> dict[str, tuple[float, ...]]:
     """Return the scores of all seeds of each setting; several points may have equal values, or write them otherwise.
 
-    A value that one sweep searches and another has fixed, or by default, is the same value.
+    A value that one sweep searches and another has fixed, or by default, is the same value. Seeds are in the order in
+    which they came to the sweep: those that a race gave come after those that decided who races.
     """
     unsearched = _unsearched(wanted.sweep)
-    scores: defaultdict[str, tuple[float, ...]] = defaultdict(tuple)
+    indices = {trial.trial_id: trial.index for trial in wanted.data.trials}
+    seeds: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
     for item in ranked_settings(wanted.data):
-        scores[meaning_of({**unsearched, **item.point})] += item.scores
-    return dict(scores)
+        came = (indices[trial_id] for trial_id in item.trial_ids)
+        seeds[meaning_of({**unsearched, **item.point})] += zip(came, item.scores, strict=True)
+    return {meaning: tuple(score for _, score in sorted(found)) for meaning, found in seeds.items()}

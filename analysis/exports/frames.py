@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from analysis.front import points_on_front
 from analysis.objectives import SettingScores, rank_settings, score_of
 from analysis.records import IterationRecord, Objective, TrialRecord
-from analysis.statistics import Estimate, iqm, probability_of_being_best, seed_intervals, tie_groups
+from analysis.statistics import (
+    Estimate,
+    iqm,
+    known_intervals,
+    probability_of_being_best,
+    tell_the_best,
+    tie_groups,
+)
 from analysis.tables import cell_value, env_steps_to, iterations_frame, point_names, trials_frame, types_with_gaps
 from policies import random_streams
 
@@ -39,6 +46,8 @@ class SweepData:
     """The env steps that a trial has, `stop.num_env_steps`."""
     threshold: float | None
     """The return that solves the env; None: nothing is said of solving."""
+    failed_score: float | None = None
+    """What a training that failed counts as, where other sweeps are looked at too; None: see `objectives`."""
     has_settings: bool = True
     """False of a population, whose trials change their values while they train."""
 
@@ -112,8 +121,8 @@ def settings_frame(data: SweepData) -> pd.DataFrame:
     (by which they are ranked, see `objectives.expected_means`), iqm, lower, upper (the 95 % interval of the mean over
     training seeds, see `statistics.seed_intervals`), probability_best, may_be_best, num_env_steps (the mean of what a
     training takes, see `objectives.env_steps_of`), on_front (of mean score against that, see `analysis.front`),
-    trial_ids. What needs two seeds of some setting is missing where none has two. A population has no settings, and no
-    rows.
+    trial_ids. What needs two seeds of some setting that differ is missing where there are none. A population has no
+    settings, and no rows.
     """
     import pandas as pd
 
@@ -166,19 +175,14 @@ def ranked_settings(data: SweepData) -> list[SettingScores]:
     if not data.has_settings or (data.objective == "steps_to_threshold" and data.threshold is None):
         return []
     return rank_settings(
-        data.trials, data.results, data.objective, num_env_steps=data.num_env_steps, threshold=data.threshold
-    )
+        data.trials, data.results, data.objective, num_env_steps=data.num_env_steps, threshold=data.threshold,
+        worst=data.failed_score,
+    )  # fmt: skip
 
 
 def intervals_of(ranking: Sequence[SettingScores]) -> list[Estimate | None]:
-    """Return the mean over seeds of each setting with its 95 % interval; None: no setting has two seeds."""
-    scores = [item.scores for item in ranking]
-    if max(map(len, scores), default=0) < 2:
-        return [None] * len(scores)
-    try:
-        return list(seed_intervals(scores))
-    except ValueError:  # so large that their squares are not finite
-        return [None] * len(scores)
+    """Return the mean over seeds of each setting with its 95 % interval; None: nothing says how much seeds differ."""
+    return known_intervals([item.scores for item in ranking])
 
 
 def _certainty(ranking: Sequence[SettingScores]) -> tuple[dict[int, float], set[int] | None]:
@@ -188,6 +192,8 @@ def _certainty(ranking: Sequence[SettingScores]) -> tuple[dict[int, float], set[
         return {}, None
     rng = random_streams.fixed()
     try:
+        if not tell_the_best(scores):
+            return {}, None
         chances = probability_of_being_best(scores, rng=rng)
         leaders = tie_groups(scores, rng=rng).with_leader
     except ValueError:

@@ -78,7 +78,8 @@ def _about(listed: Sequence[tuple[SettingScores, Estimate | None]], data: SweepD
         goal = f"{data.threshold:g}"
         parts.append(f" Solved: seeds whose mean training return over 100 episodes reached {_number_of(goal)}.")
     if any(item.num_failed for item, _ in listed):
-        parts.append(" A failed seed counts as the worst trial.")
+        worst = "one that never reaches it" if data.objective == "steps_to_threshold" else "the worst trial"
+        parts.append(f" A failed seed counts as {worst}.")
     return "".join(parts)
 
 

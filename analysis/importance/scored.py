@@ -1,8 +1,8 @@
 """The score of each point of a sweep, all judged after the same training.
 
 The seeds of a point are one cluster: a point counts once, with its mean. A trial that failed, or never showed anything
-that can be scored, has the worst score of all. Where a scheduler ended trials early, all are judged at the env steps of
-the first one that it ended (`analysis.importance.cut_short`).
+that can be scored, has the worst score of all (`objectives.failed_score`). Where a scheduler ended trials early, all
+are judged at the env steps of the first one that it ended (`analysis.importance.cut_short`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from analysis.importance.cut_short import is_evaluated, notes_of_cut, rows_until, training_alone
-from analysis.objectives import score_of
+from analysis.objectives import failed_score, score_of
 from analysis.records import FINISHED, IterationRecord, Objective, SweepRecord, TrialRecord, finite_or_none
 from analysis.wording import counted
 
@@ -76,7 +76,7 @@ def score_points(
     if not known:
         by_then = "" if first_cut is None else f" by {first_cut:,} env steps, where the scheduler ended the first"
         return Scored(objective, (), (), 0, f"No trial showed a score{by_then}.")
-    worst = min(known)
+    worst = failed_score(known, objective, num_env_steps=first_cut or whole)
     seeds: defaultdict[int, list[float]] = defaultdict(list)
     values: dict[int, dict[str, Any]] = {}
     for trial in ended:

@@ -6,7 +6,7 @@ import math
 import shlex
 from dataclasses import dataclass
 
-from analysis.answers import certainty, setting_score
+from analysis.answers import certainty, setting_score, why_unsure
 from analysis.best_records import EvaluationRecord, SettingRecord, SettingsRecord
 from analysis.page.estimates import replicate_takes
 from analysis.page.scores import score_text
@@ -84,7 +84,8 @@ def _of_settings(source: Source, settings: SettingsRecord) -> list[str]:
         score = score_text(settings, settings.best.score)
         return [f"All {settings.num_settings:,} settings scored {score}: the data can't order them."]
     if settings.best.probability_best is None:
-        return _one_seed(source, settings)
+        several = max(len(item.scores) for item in settings.ranking) > 1
+        return _unsure(source, settings) if several else _one_seed(source, settings)
     return [*_use(source, settings), *_runner_up(source, settings)]
 
 
@@ -107,6 +108,17 @@ def _one_seed(source: Source, settings: SettingsRecord) -> list[str]:
     text = setting_score(settings.model_copy(update={"ranking": (best,)}))
     leader = f"{point_text(best.point)} did best with its one seed: {text}."
     return [f"One seed a setting names a good policy, not a good setting{ties}.", leader]
+
+
+def _unsure(source: Source, settings: SettingsRecord) -> list[str]:
+    """Say who leads where settings have several seeds, and nothing is known of how much these differ."""
+    best = settings.best
+    tied = sum(item.score == best.score for item in settings.ranking)
+    # More may tie than are listed.
+    least = "at least " if tied == len(settings.ranking) else ""
+    ties = f"; {least}{tied:,} of {settings.num_settings:,} settings tie" if tied > 1 else ""
+    leads = f"{point_text(best.point)} leads: {_outcome(source, settings, best)}{ties}."
+    return [f"{why_unsure(settings).capitalize()}; {leads}"]
 
 
 def _use(source: Source, settings: SettingsRecord) -> list[str]:

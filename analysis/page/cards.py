@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.answers import certainty
+from analysis.answers import certainty, less_expected, why_unsure
 from analysis.best_records import BestRecord, SettingRecord
 from analysis.choice_words import COLUMNS, candidate_rows, chosen_from
 from analysis.collapse import collapses, collapses_text
@@ -63,11 +63,13 @@ class SettingCard:
     means: str
     """What the score is: "in the later half of training"."""
     interval: str | None
-    """None: it was trained with one seed, or no setting with several."""
+    """None: nothing says how much seeds differ."""
+    expected: str
+    """What is to be expected of more seeds; empty: as much as its score."""
     badge: tuple[str, str] | None
     """Whether its seeds solved the env: the text and its CSS class; None: there is no threshold."""
     certainty: str
-    """How sure it is the best; empty: one seed a setting."""
+    """How sure it is the best."""
     trial_ids: str
     num_failed: int
     collapsed: str
@@ -213,8 +215,9 @@ def setting_card(source: Source) -> SettingCard | None:
         score=score_text(settings, best.score),
         means=score_means(settings),
         interval=interval_of(settings, best),
+        expected=less_expected(settings),
         badge=_solved_badge(best),
-        certainty="" if best.probability_best is None else certainty(settings),
+        certainty=f"{why_unsure(settings).capitalize()}." if best.probability_best is None else certainty(settings),
         trial_ids=", ".join(best.trial_ids),
         num_failed=best.num_failed,
         collapsed=collapses_text(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from analysis.answers import why_unsure
 from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.page.scores import counts_env_steps, interval_of, score_means, score_text
 from analysis.page.source import Source, point_text
@@ -17,6 +18,7 @@ from analysis.tables import SOLVED_OVER_NUM_EPISODES, cell_value, solving_point,
 from analysis.wording import NONE, number
 from policies import random_streams
 
+_WORST = "the worst score of the sweep"
 _ONE_SEED = (
     "Each was trained with one seed: how much seeds differ is not known, so there are no intervals, and nothing says "
     "that the first is the best."
@@ -25,6 +27,7 @@ _SEVERAL_SEEDS = (
     "Intervals are over training seeds, and learn from all settings how much seeds differ. P(best) is the probability "
     "that no other setting is better. Settings that share a letter can't be told apart."
 )
+_LEADS_BY_THEM = "The first leads by the seeds that its score is of: fresh ones would likely score less."
 _MAX_LABEL = 26
 """A longer text of a setting is not written beside its dots; the table has it."""
 
@@ -111,10 +114,22 @@ def _about(source: Source) -> list[str]:
         return []
     listed = len(settings.ranking)
     texts = [f"The first {listed} of {settings.num_settings:,} settings." if listed < settings.num_settings else ""]
-    texts += [_ONE_SEED if settings.best.probability_best is None else _SEVERAL_SEEDS]
+    texts += _of_seeds(settings)
     if any(item.num_failed for item in settings.ranking):
-        texts += ["A seed that failed counts as the worst score of the sweep."]
+        worst = "a training that never reaches the threshold" if counts_env_steps(settings) else _WORST
+        texts += [f"A seed that failed counts as {worst}."]
     return [text for text in texts if text]
+
+
+def _of_seeds(settings: SettingsRecord) -> list[str]:
+    if max(len(item.scores) for item in settings.ranking) < 2:
+        return [_ONE_SEED]
+    if settings.best.lower is None:
+        # Where nothing but one score is known, each is as probably the best.
+        return [
+            f"{why_unsure(settings).capitalize()}: there are no intervals, and nothing says that the first is the best."
+        ]
+    return [_SEVERAL_SEEDS, _LEADS_BY_THEM]
 
 
 def _letters(source: Source, settings: SettingsRecord) -> dict[int, str]:

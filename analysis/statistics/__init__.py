@@ -23,7 +23,14 @@ from analysis.statistics.comparisons import Profile, iqm_with_ci, performance_pr
 from analysis.statistics.estimate import Estimate
 from analysis.statistics.few_seeds import bootstrap_t_interval, t_interval
 from analysis.statistics.learning_curve import area_under_curve, has_collapsed, share_lost
-from analysis.statistics.many_settings import ModeratedMeans, moderated_means, seed_intervals
+from analysis.statistics.many_settings import (
+    ModeratedMeans,
+    known_intervals,
+    moderated_means,
+    seed_intervals,
+    seeds_differ,
+    tell_the_best,
+)
 from analysis.statistics.means import (
     MIN_SEEDS_FOR_INTERVAL,
     iqm,
@@ -48,6 +55,7 @@ __all__ = [
     "has_collapsed",
     "iqm",
     "iqm_with_ci",
+    "known_intervals",
     "mean_with_ci",
     "median_steps",
     "moderated_means",
@@ -56,10 +64,12 @@ __all__ = [
     "probability_of_being_best",
     "probability_of_improvement",
     "seed_intervals",
+    "seeds_differ",
     "share_lost",
     "small_sample_note",
     "steps_to_threshold",
     "t_interval",
     "t_quantile",
+    "tell_the_best",
     "tie_groups",
 ]

@@ -94,6 +94,27 @@ def moderated_means(settings: Sequence[Values]) -> ModeratedMeans:
     return ModeratedMeans(means, np.sqrt(moderated / sizes), dfs, sizes, own, math.isinf(prior_df))
 
 
+def seeds_differ(settings: Sequence[Values]) -> bool:
+    """Whether in any setting two seeds differ; where not, nothing is known of how much they may.
+
+    Raises:
+        ValueError: In the cases of `moderated_means`.
+    """
+    return bool(moderated_means(settings).standard_errors.max() > 0.0)
+
+
+def tell_the_best(settings: Sequence[Values]) -> bool:
+    """Whether scores say how probably each setting is the best: seeds differ, or there is nothing but one score.
+
+    Of one score for all seeds of all settings each is as probably the best. Of several, where no two seeds of a setting
+    differ, nobody knows whether settings differ or seeds would.
+
+    Raises:
+        ValueError: In the cases of `moderated_means`.
+    """
+    return seeds_differ(settings) or len({float(score) for scores in settings for score in scores}) == 1
+
+
 def seed_intervals(
     settings: Sequence[Values],
     *,
@@ -135,6 +156,17 @@ def seed_intervals(
         Estimate(float(mean), max(float(mean - half), low), min(float(mean + half), high), int(size), note)
         for mean, half, size, note in zip(fit.means, halves, fit.num_seeds, _notes(fit), strict=True)
     ]
+
+
+def known_intervals(settings: Sequence[Values]) -> list[Estimate | None]:
+    """Return `seed_intervals`, but None for each setting where nothing is known of how much seeds differ.
+
+    That is where no setting has two seeds, no two seeds of a setting differ, or scores are too large to be squared.
+    """
+    try:
+        return list(seed_intervals(settings)) if seeds_differ(settings) else [None] * len(settings)
+    except ValueError:
+        return [None] * len(settings)
 
 
 def _prior(variances: NDArray[np.float64], dfs: NDArray[np.float64]) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import pytest
 
 from tests.benchmarks.choice.calibration import by_bin, calibrate
 from tests.benchmarks.choice.collecting import DATA, task_names
+from tests.benchmarks.choice.named import named_settings
 from tests.benchmarks.choice.regret import RULES, Rule, regrets
 from tests.benchmarks.choice.rules import SCORES, MeanOfSeeds, Seeds
 from tests.benchmarks.choice.trained import Floats, Task, read_task
@@ -65,6 +66,16 @@ def test_normal_scores_are_covered_as_stated() -> None:
     # 1,200 intervals, of 20 settings: more than four standard errors, were they independent.
     assert 0.92 < found.coverage < 0.98
     assert sum(count for _, count, _, _ in by_bin([found])) == 600
+
+
+def test_the_score_of_a_setting_that_is_named_is_flattered_and_the_expected_one_less() -> None:
+    alike = named_settings(made(np.linspace(0, 0.5, 20), 1.0), 100)
+    assert alike.score_gaps.mean() > 1.0
+    assert abs(alike.expected_gaps.mean()) < alike.score_gaps.mean() / 2
+    # Where settings differ far more than seeds, the choice flatters nobody.
+    apart = named_settings(made(np.arange(20.0) * 20, 1.0), 100)
+    assert abs(apart.score_gaps.mean()) < 0.01
+    assert apart.coverage > alike.coverage
 
 
 def test_every_task_was_trained_with_twenty_seeds_of_twenty_settings() -> None:

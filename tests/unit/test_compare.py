@@ -112,12 +112,15 @@ def test_where_all_trials_failed_it_is_said_with_the_first_error() -> None:
     assert "A and B have no scores" in said(both)
 
 
-def test_a_failed_seed_counts_as_the_worst_of_its_sweep() -> None:
+def test_a_failed_seed_counts_as_the_worst_of_all_that_are_compared() -> None:
     left = wanted("a", [9.0, 8.0], [1.0, 1.0])
     trials = [left.data.trials[0].model_copy(update={"status": "failed"}), *left.data.trials[1:]]
     found = compare([dataclasses.replace(left, data=dataclasses.replace(left.data, trials=trials)), wanted("b", RIGHT)])
     assert found.entries[0].scores == (1.0, 8.0)
-    assert "A failed seed counts as the worst trial of its sweep." in found.notes
+    assert "A failed seed counts as the worst training of all that are compared." in found.notes
+    worse = wanted("b", [0.5, 7.0])
+    ours = dataclasses.replace(left, data=dataclasses.replace(left.data, trials=trials))
+    assert compare([ours, worse]).entries[0].scores == (0.5, 8.0)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e300])

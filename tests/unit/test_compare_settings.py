@@ -85,7 +85,28 @@ def test_all_points_of_equal_values_are_one_setting() -> None:
     assert shared.num_settings == 2
     # Two of three are above 50, and 80 is above 70.
     assert shared.probability.mean == pytest.approx((2 / 3 + 1) / 2)
-    assert shared.left_iqm.mean == pytest.approx(stats.trim_mean([100.0, 90.0, 10.0, 80.0], 0.25))
+    # The other sweep has one seed of each, so the first ones count.
+    assert shared.left_iqm.mean == pytest.approx(stats.trim_mean([100.0, 80.0], 0.25))
+
+
+def test_seeds_that_a_race_gave_raise_no_sweeps_interquartile_mean() -> None:
+    plain = [[50.0 * level - 2, 50.0 * level + 2] for level in range(1, 9)]
+    raced = [[*seeds, *(seeds * 3 if index >= 6 else [])] for index, seeds in enumerate(plain)]
+    shared = present(the_pair(compare([wanted("a", *raced), wanted("b", *plain)])).shared)
+    assert shared.probability.mean == 0.5
+    for iqm in (shared.left_iqm, shared.right_iqm):
+        assert iqm.mean == pytest.approx(stats.trim_mean(np.concatenate(plain), 0.25))
+
+
+def test_the_seeds_that_came_first_count_of_points_that_are_one_setting() -> None:
+    """The second point of equal values ranks first, as its seed was the better one."""
+    left, right = wanted("a", [10.0, 30.0, 40.0], [90.0], values=[0.1, 0.1]), wanted("b", [50.0], values=[0.1])
+    # The race came when both points were trained.
+    came = {"t0000": 0, "t0003": 1, "t0001": 2, "t0002": 3}
+    trials = [trial.model_copy(update={"index": came[trial.trial_id]}) for trial in left.data.trials]
+    left = dataclasses.replace(left, data=dataclasses.replace(left.data, trials=trials))
+    shared = present(the_pair(compare([left, right])).shared)
+    assert shared.left_iqm.mean == 10.0
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from known_scores import SPACE, Score, by_activation, by_log_lr, draw, effect_of, slope_of_log_lr, sweep_of
 
 from analysis.importance.edges import _beyond
+from analysis.importance.scored import score_points
 from analysis.importance.searched import Searched
 from analysis.records import ChangeRecord
 
@@ -303,6 +304,19 @@ class TestFairness:
         assert any("counted as the worst" in note for note in mattered.notes)
         means = {level.label: level.mean for level in effect_of(mattered, "activation").levels}
         assert means["relu"] < means["tanh"]
+
+    @pytest.mark.parametrize(("ended_at", "whole"), [(1_000, 1_000), (300, 300)])
+    def test_by_env_steps_a_failed_trial_counts_as_one_that_never_reached_the_threshold(
+        self, ended_at: int, whole: int
+    ) -> None:
+        sweep = sweep_of(
+            draw(3), lambda _: 10.0,
+            objective={"type": "steps_to_threshold", "threshold": 5.0},
+            status=lambda index: ("failed", "stopped" if ended_at < 1_000 else "completed", "completed")[index],
+            steps=lambda index: ended_at if index == 1 else 1_000,
+        )  # fmt: skip
+        scored = score_points(sweep.sweep, sweep.trials, sweep.results, None)
+        assert scored.scores == (-2.0 * whole, -100.0, -100.0)
 
     def test_trials_that_were_ended_early_are_compared_with_others_at_the_same_env_steps(self) -> None:
         points = draw(30)

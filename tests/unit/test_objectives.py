@@ -167,6 +167,21 @@ def test_a_failed_seed_counts_as_the_worst_of_the_sweep() -> None:
     assert second.num_failed == 1
 
 
+def test_by_env_steps_a_failed_seed_counts_as_one_that_never_reached_the_threshold() -> None:
+    # One seed that reached it early and two that failed, beside three that reached it late.
+    trials, results = made([[100.0, None, None], [100.0, 100.0, 100.0]])
+    for late in trials[3:]:
+        results[late.trial_id] = [iteration(1_000, 9.0), iteration(5_000, 100.0)]
+    first, second = rank_settings(trials, results, "steps_to_threshold", num_env_steps=CAP, threshold=50.0)
+    assert (first.point_index, first.scores) == (1, (-5_000, -5_000, -5_000))
+    assert second.scores == (-1_000, -2 * CAP, -2 * CAP)
+    # What trained to its end and never reached it is as bad.
+    results["t0001"] = [iteration(CAP, 9.0)]
+    trials[1] = trial(1, 0, 1)
+    ranked_again = rank_settings(trials, results, "steps_to_threshold", num_env_steps=CAP, threshold=50.0)
+    assert [item.scores for item in ranked_again] == [first.scores, second.scores]
+
+
 def test_who_has_the_worst_score_for_a_failure_comes_behind_who_has_earned_it() -> None:
     # The worst score that is known is the best one, too.
     assert [item.point_index for item in ranked([[None], [None], [480], [None]])] == [2, 0, 1, 3]

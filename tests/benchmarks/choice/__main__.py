@@ -16,6 +16,7 @@ import numpy as np
 
 from tests.benchmarks.choice.calibration import Calibration, by_bin, calibrate
 from tests.benchmarks.choice.collecting import DATA
+from tests.benchmarks.choice.named import Named, named_settings
 from tests.benchmarks.choice.regret import AT_EQUAL_COST, DEFAULT, RULES, Regret, regrets
 from tests.benchmarks.choice.trained import Task, read_task
 from tests.benchmarks.ppo import machine_name
@@ -35,7 +36,8 @@ def tables(tasks: Sequence[Task], num_draws: int) -> Iterator[str]:
     yield from _verdict(found)
     yield ""
     said = {count: [calibrate(task, count, max(1, num_draws // 4)) for task in tasks] for count in NUM_SEEDS}
-    yield from _coverage_table(tasks, said)
+    named = [named_settings(task, num_draws) for task in tasks]
+    yield from _coverage_table(tasks, said, named)
     yield ""
     yield from _best_table(said)
 
@@ -78,13 +80,30 @@ def _verdict(found: dict[str, list[Regret]]) -> Iterator[str]:
     )
 
 
-def _coverage_table(tasks: Sequence[Task], said: dict[int, list[Calibration]]) -> Iterator[str]:
+def _coverage_table(tasks: Sequence[Task], said: dict[int, list[Calibration]], named: Sequence[Named]) -> Iterator[str]:
     yield f"| 95 % intervals that hold the truth, of | {' | '.join(task.name for task in tasks)} | mean |"
     yield "|---" * (len(tasks) + 2) + "|"
     for count, found in said.items():
         cells = [f"{100 * item.coverage:.1f} %" for item in found]
         mean = 100 * float(np.mean([item.coverage for item in found]))
         yield f"| {count} seeds | {' | '.join(cells)} | {mean:.1f} % |"
+    yield from _named_rows(named)
+
+
+def _named_rows(named: Sequence[Named]) -> Iterator[str]:
+    coverages = [item.coverage for item in named]
+    cells = [f"{100 * value:.1f} %" for value in (*coverages, float(np.mean(coverages)))]
+    yield f"| the setting that a launch names | {' | '.join(cells)} |"
+    yield ""
+    score, expected = (
+        [float(values.mean()) for values in found]
+        for found in zip(*((item.score_gaps, item.expected_gaps) for item in named), strict=True)
+    )
+    yield (
+        f"The score of the setting that a launch names is {np.mean(score):.2f} of best minus median too high in the "
+        f"mean ({min(score):.2f} to {max(score):.2f} by task), and what is told to be expected of more seeds "
+        f"{np.mean(expected):.2f} ({min(expected):.2f} to {max(expected):.2f})."
+    )
 
 
 def _best_table(said: dict[int, list[Calibration]]) -> Iterator[str]:
