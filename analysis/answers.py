@@ -17,6 +17,8 @@ _MEANS: dict[Objective, str] = {
     "best": "in its best evaluation",
     "steps_to_threshold": "env steps to the threshold",
 }
+_TOLD_SHARE = 0.1
+"""Of half an interval: by so much less than its score has to be expected of a setting for that to be told."""
 
 
 def setting_score(settings: SettingsRecord) -> str:
@@ -42,10 +44,16 @@ def setting_score(settings: SettingsRecord) -> str:
 
 
 def less_expected(settings: SettingsRecord) -> str:
-    """Say what is to be expected of more seeds of the leading setting, if that is less than its score; else empty."""
+    """Say what is to be expected of more seeds of the leading setting, if that is less than its score; else empty.
+
+    Less by a tenth of half its interval is told: what is smaller says nothing beside that.
+    """
     best = settings.best
+    less = best.score - best.expected
     score, expected = (_score_text(settings, value) for value in (best.score, best.expected))
-    if best.expected >= best.score or expected == score:
+    if best.lower is not None and best.upper is not None:
+        less -= _TOLD_SHARE * (best.upper - best.lower) / 2
+    if less <= 0.0 or expected == score:
         return ""
     return f"{expected} is to be expected of more seeds"
 

@@ -71,6 +71,14 @@ def test_nothing_is_told_of_more_seeds_where_they_would_score_the_same() -> None
         assert present(setting_card(source)).expected == ""
 
 
+@pytest.mark.parametrize(("expected", "is_told"), [(99.1, False), (98.9, True)])
+def test_less_than_a_tenth_of_half_the_interval_is_not_told(expected: float, is_told: bool) -> None:
+    settings = present(source_of([100.0, 20.0], [90.0, 30.0]).settings)
+    best = settings.best.model_copy(update={"score": 100.0, "lower": 90.0, "upper": 110.0, "expected": expected})
+    told = settings.model_copy(update={"ranking": (best, *settings.ranking[1:])})
+    assert (f"{expected} is to be expected of more seeds" in setting_score(told)) == is_told
+
+
 def test_the_report_says_that_the_leader_was_chosen_by_its_seeds() -> None:
     told = "The first leads by the seeds that its score is of: fresh ones would likely score less."
     assert told in about(source_of([100.0, 20.0], [90.0, 30.0]))
