@@ -14,7 +14,15 @@ from analysis.best_records import BestRecord
 from analysis.points import EMPTY, lacks
 from analysis.records import FINISHED, IterationRecord, TrialRecord
 from analysis.selection import rank_points
-from analysis.tables import groups_frame, point_names, points_of, shown_point, steps_to_solve_frame, trials_frame
+from analysis.tables import (
+    groups_frame,
+    idle_column,
+    point_names,
+    shown_point,
+    solving_point,
+    steps_to_solve_frame,
+    trials_frame,
+)
 from analysis.wording import NONE, is_number, number, return_text
 
 MAX_STEPS_ROWS = 20
@@ -114,9 +122,9 @@ def group_table(
     if goal is not None:
         columns |= {"num_solved": "solved", "min_num_env_steps_to_solve": "fewest env steps to solve"}
     columns |= {"best_score": "best score", "mean_score": "mean score"}
-    lacking = _lacking(trials, names)
     rows = [
-        [_cell(str(name), row[name], is_empty=name in lacking) for name in columns] for row in frame.to_dict("records")
+        [_cell(str(name), row[name], is_empty=name in names and row[idle_column(name)]) for name in columns]
+        for row in frame.to_dict("records")
     ]
     return Table(list(columns.values()), rows)
 
@@ -132,19 +140,19 @@ def steps_table(
         return Table([], [])
     frame = steps_to_solve_frame(trials, results, threshold=goal)
     names = point_names(trials)
-    lacking = _lacking(trials, names)
     seeds: dict[int, list[TrialRecord]] = {}
     for trial in sorted(trials, key=lambda trial: trial.seed_index):
         seeds.setdefault(trial.point_index, []).append(trial)
     rows = []
     for row in frame[frame["num_solved"] > 0].head(MAX_STEPS_ROWS).to_dict("records"):
+        members = seeds[row["point_index"]]
+        # As the frame has it: seeds of one point have the same values, and a population has one seed a point.
+        point = solving_point(members[0], goal, results.get(members[0].trial_id, ()))
         # The frame has a column for each seed of any point; this one may have been given fewer.
-        each = ", ".join(
-            _steps_of_seed(row[f"num_env_steps_seed_{trial.seed_index}"], trial) for trial in seeds[row["point_index"]]
-        )
+        each = ", ".join(_steps_of_seed(row[f"num_env_steps_seed_{trial.seed_index}"], trial) for trial in members)
         rows.append(
             [
-                *(_cell(name, row[name], is_empty=name in lacking) for name in names),
+                *(_cell(name, row[name], is_empty=lacks(point, name)) for name in names),
                 Cell(row["num_solved"], f"{row['num_solved']} of {row['num_seeds']}"),
                 _cell("median_num_env_steps", row["median_num_env_steps"]),
                 Cell(each, each, "wide"),
@@ -162,12 +170,6 @@ def _steps_of_seed(num_env_steps: Any, trial: TrialRecord) -> str:
     if cell.value is not None:
         return cell.text
     return "not solved" if trial.status in FINISHED else "not ended yet"
-
-
-def _lacking(trials: Sequence[TrialRecord], names: Sequence[str]) -> set[str]:
-    """Return the names of values that some trials don't have, or had not for a time, as they don't act there."""
-    points = [point for trial in trials for point in points_of(trial)]
-    return {name for name in names if any(lacks(point, name) for point in points)}
 
 
 def _cell(name: str, value: Any, *, is_empty: bool = False) -> Cell:

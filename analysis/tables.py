@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.collapse import collapsed_trials
-from analysis.points import searched_names
+from analysis.points import lacks, searched_names
 from analysis.records import FINISHED, ChangeRecord, IterationRecord, TrialRecord
 from analysis.selection import error_summary, score_trial
 from analysis.statistics import median_steps
@@ -266,6 +266,11 @@ def iterations_frame(results: Mapping[str, Sequence[IterationRecord]]) -> pd.Dat
     return frame.astype(dict.fromkeys(floats, "float64"))
 
 
+def idle_column(name: str) -> str:
+    """Return the column of `groups_frame` that says whether a hyperparameter does not act in a group."""
+    return f"{name} does not act"
+
+
 def groups_frame(
     trials: Sequence[TrialRecord],
     results: Mapping[str, Sequence[IterationRecord]],
@@ -282,11 +287,16 @@ def groups_frame(
         threshold: Training return that counts as solved; None: none does.
 
     Returns:
-        The columns `names`, num_trials, num_failed, num_solved, min_num_env_steps_to_solve, best_score,
-        mean_score; those that solved in the fewest env steps first, then by best score.
+        The columns `names`, the `idle_column` of each of them, num_trials, num_failed, num_solved,
+        min_num_env_steps_to_solve, best_score, mean_score; those that solved in the fewest env steps first, then by
+        best score.
     """
     frame = trials_frame(trials, results, threshold=threshold)
-    groups = frame.groupby(list(names), sort=False, dropna=False)
+    # A cell is missing of a searched null and of a value that does not act: they are not one group.
+    points = {trial.trial_id: shown_point(trial) for trial in trials}
+    for name in names:
+        frame[idle_column(name)] = [lacks(points[trial_id], name) for trial_id in frame["trial_id"]]
+    groups = frame.groupby([*names, *map(idle_column, names)], sort=False, dropna=False)
     table = groups.agg(
         num_trials=("trial_id", "size"),
         num_failed=("status", lambda status: int((status == "failed").sum())),

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.exports.frames import SweepData, ranked_settings
 from analysis.objectives import SettingScores
-from analysis.plot_style import ACCENT, GRID, PALETTE, drawable, escape, new_figure, steps_axis, style_axes
+from analysis.plot_style import ACCENT, GRID, MARKERS, PALETTE, drawable, escape, new_figure, steps_axis, style_axes
 from analysis.points import searched_names
 from analysis.statistics import seed_intervals
 from analysis.tables import cell_value
@@ -29,6 +29,8 @@ COLUMN_WIDTH = (3.4, 2.5)
 """The size of a figure in one column of a paper with two, inches."""
 FORMATS = ("pdf", "svg", "png")
 _NUM_POINTS = 120
+_NUM_MARKERS = 8
+"""About how many markers a curve has that needs them to be told from another of its colour."""
 _FONT_SIZE = 8.0
 _AXES: dict[Returns, str] = {
     "evaluation": "evaluation return",
@@ -124,7 +126,7 @@ def learning_figure(
 
     A curve is the mean over the seeds of a setting, its band the 95 % interval of that mean; with one seed a setting
     there is no band. Curves are dashed from where the first of their seeds has ended. The legend says of how many seeds
-    a curve is, and of how many it should be.
+    a curve is, and of how many it should be. Where there are more curves than colours, the later ones have markers.
 
     Args:
         sweeps: Name and data of each sweep; the name is part of labels if there are several.
@@ -146,7 +148,7 @@ def learning_figure(
     axes = figure.subplots()
     for number, (name, curve) in enumerate(curves):
         label = curve.label if len(sweeps) == 1 else f"{name}: {curve.label}" if top > 1 and curve.label else name
-        _draw_curve(axes, curve, label, PALETTE[number % len(PALETTE)])
+        _draw_curve(axes, curve, label, number)
     style_axes(axes, xlabel="env steps", ylabel=_AXES[returns])
     axes.grid(visible=True, color=GRID, linewidth=0.5)
     steps_axis(axes)
@@ -164,22 +166,25 @@ def learning_figure(
     return figure
 
 
-def _draw_curve(axes: Axes, curve: Curve, label: str, color: str) -> None:
-    """Draw a curve with its band and, in the legend, its number of seeds."""
+def _draw_curve(axes: Axes, curve: Curve, label: str, number: int) -> None:
+    """Draw a curve with its band and, in the legend, its number of seeds; its number is its place among all curves."""
+    turn, place = divmod(number, len(PALETTE))
+    color = PALETTE[place]
     steps, mean = curve.num_env_steps, drawable(curve.mean)
     whole = steps <= curve.first_end
     seeds = counted(curve.num_seeds + curve.num_without, "seed")
     seeds = f"{curve.num_seeds:,} of {seeds}" if curve.num_without else seeds
     told = f"{label} ({seeds})" if label else seeds
-    # A line of one place can't be seen.
-    marker = "o" if steps.size == 1 else ""
-    axes.plot(steps[whole], mean[whole], color=color, linewidth=1.2, marker=marker, markersize=3, label=escape(told))
+    # A line of one place can't be seen, and from the second turn on a colour alone tells no curve.
+    marker = MARKERS[turn % len(MARKERS)] if turn or steps.size == 1 else ""
+    look: dict[str, Any] = {"color": color, "marker": marker, "markersize": 3}
+    look["markevery"] = max(1, steps.size // _NUM_MARKERS)
+    axes.plot(steps[whole], mean[whole], linewidth=1.2, label=escape(told), **look)
     after = np.flatnonzero(~whole)
     if after.size:
         # The dashes begin where the line ends, so that there is no gap.
         rest = slice(max(0, int(after[0]) - 1), None)
-        dashes = (0, (3, 2))
-        axes.plot(steps[rest], mean[rest], color=color, linewidth=1.0, linestyle=dashes, marker=marker, markersize=3)
+        axes.plot(steps[rest], mean[rest], linewidth=1.0, linestyle=(0, (3, 2)), **look)
     if curve.lower is not None and curve.upper is not None:
         low, high = drawable(curve.lower), drawable(curve.upper)
         axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)

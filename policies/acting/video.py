@@ -6,6 +6,7 @@ drawn, so a long episode needs no memory for its MP4; the GIF keeps a bounded nu
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -298,14 +299,25 @@ def _captioned(panel: _Panel, scale: float) -> Image.Image:
     draw = ImageDraw.Draw(picture)
     font = _font(round(strip * 0.46))
     pad, middle = round(strip * 0.3), strip / 2
-    total = f"{panel.total:.0f}" if float(panel.total).is_integer() else f"{panel.total:.1f}"
     # Two columns of fixed width, or the words would move whenever the numbers grow.
     right: float = width - pad
-    for label, number, colour in (("return", total, _TEXT), ("step", str(panel.steps), _DIM)):
+    columns = (("return", _total_text(panel.total), "-0.000", _TEXT), ("step", str(panel.steps), "000", _DIM))
+    for label, number, room, colour in columns:
         draw.text((right, middle), f"{label} {number}", font=font, fill=colour, anchor="rm")
-        right -= max(draw.textlength(f"{label} {digits}", font) for digits in ("000", number)) + pad
+        right -= max(draw.textlength(f"{label} {digits}", font) for digits in (room, number)) + pad
     draw.text((pad, middle), _shorten(panel.title, draw, font, right - pad), font=font, fill=_TEXT, anchor="lm")
     return picture
+
+
+def _total_text(total: float) -> str:
+    """Return the text of a return: one decimal; more where it is small, as reports have them; none of a whole one."""
+    size = abs(float(total))
+    if size.is_integer() or not math.isfinite(size):
+        return f"{total:z.0f}"
+    if size >= 2.0:
+        return f"{total:z.1f}"
+    decimals = 3 if size >= 0.01 else 2 - math.floor(math.log10(size))
+    return f"{total:z.{decimals}f}" if decimals <= 8 else f"{total:z.3g}"
 
 
 def _filter(scale: float) -> Image.Resampling:

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import AtariPreprocessing, TimeLimit
 from numpy.typing import NDArray
 
@@ -28,6 +29,7 @@ ATARI = "atari"
 INSTALL = "Install it, on every machine that runs trials: pip install 'tune-jobs[atari]'."
 _FRAMES_PER_SECOND = 60
 _PACKAGE = "ale_py"
+_RAM = "ram"
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class AtariFrames:
             env_args: The arguments of its constructor; `max_episode_steps` is left out.
 
         Raises:
-            EnvError: The environment skips no frames, as an Atari game does, or its arguments ask for it.
+            EnvError: The environment skips no frames, as an Atari game does, its arguments ask for it, or they ask for
+                the emulator's memory in place of its screen.
         """
         args = {name: value for name, value in env_args.items() if name != "max_episode_steps"}
         takes = () if creator is None else inspect.signature(creator).parameters
@@ -83,10 +86,26 @@ class AtariFrames:
                 "itself: they would be skipped twice.",
                 f"Leave it out, and set env.{ATARI}.frame_skip.",
             )
+        if args.get("obs_type") == _RAM:
+            raise EnvError(
+                f"The env argument 'obs_type' of {env_id} is {_RAM!r}, but env.{ATARI} observes the screen, not "
+                "the emulator's memory.",
+                f"Leave it out, or leave env.{ATARI} out.",
+            )
         if "obs_type" in takes:
             # The frames are read from the emulator; drawing each of them in colour too would cost a tenth of the time.
             args.setdefault("obs_type", "grayscale")
         return args
+
+    def limit_outside(self, spec: EnvSpec, env_args: dict[str, Any]) -> EnvSpec:
+        """Return a registry entry without its limit, which goes to the arguments if they have none.
+
+        Gymnasium would set it inside the preprocessing, where it counts frames.
+        """
+        if spec.max_episode_steps is None:
+            return spec
+        env_args.setdefault("max_episode_steps", spec.max_episode_steps)
+        return replace(spec, max_episode_steps=None)
 
     def wrap(self, env: gym.Env[Any, Any], env_args: Mapping[str, Any]) -> gym.Env[Any, Any]:
         """Return a game with its preprocessing and, around it, its time limit in env steps.
@@ -96,10 +115,16 @@ class AtariFrames:
             env_args: The arguments of its constructor, with those of its registry entry.
 
         Raises:
-            EnvError: It is no Atari game, or OpenCV is not installed.
+            EnvError: It is no Atari game, takes no no-ops where some are asked for, or OpenCV is not installed.
         """
         if not hasattr(env.unwrapped, "ale"):
             raise _no_game(env.spec.id if env.spec is not None else type(env.unwrapped).__name__)
+        if self.noop_max and not isinstance(env.action_space, gym.spaces.Discrete):
+            raise EnvError(
+                f"env.{ATARI} begins a game with no-ops, up to {self.noop_max}, which a game with continuous actions "
+                "does not take.",
+                f"Set env.{ATARI}.noop_max: 0, or leave 'continuous' out of the env's arguments.",
+            )
         try:
             wrapped: gym.Env[Any, Any] = AtariPreprocessing(
                 env,

@@ -38,7 +38,7 @@ from policies.envs.rendering import choose_before_import, draw_without_display, 
 from policies.envs.signatures import named_parameters, takes_any_name
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
-from policies.envs.time_limits import checked_time_limit
+from policies.envs.time_limits import time_limit_of
 from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
@@ -134,7 +134,7 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
             observation_space=env.observation_space,
             action_space=env.action_space,
             threshold=None if spec.reward_threshold is None else float(spec.reward_threshold),
-            max_episode_steps=checked_time_limit(env, env_id, kwargs.get(_LIMIT)),
+            max_episode_steps=time_limit_of(env),
             has_vector_entry_point=not is_changed
             and _may_be_vectorised(env_id, spec, wrappers)
             and takes_vector_entry_point(spec, kwargs),
@@ -194,7 +194,7 @@ def make_vector_env(
     """Make a vector environment: the env's own vectorised version if it has one, else a loop over envs.
 
     Both reset a sub-environment in the step after its episode ended (`AutoresetMode.NEXT_STEP`) and both have
-    the env's time limit. Which one is made is `EnvInfo.has_vector_entry_point`.
+    the env's time limit. Which one is made is `EnvInfo.has_vector_entry_point`, if its own does not reset otherwise.
 
     Args:
         env_id: Gymnasium id, or `module:Name`.
@@ -209,8 +209,7 @@ def make_vector_env(
         EnvError: In the same cases as `make_env`; or there is a penalty, and the env has no failure.
     """
     env_id, spec, kwargs, wrappers = _find(env_id, env_args)
-    # Looked at before the render mode joins the arguments.
-    own_args = dict(kwargs)
+    own_args = dict(kwargs)  # before the render mode joins them
     try:
         with calls.inside(Call.CONSTRUCTOR):
             env = own_vector_env(spec, num_envs, kwargs) if _may_be_vectorised(env_id, spec, wrappers) else None
@@ -243,6 +242,8 @@ def _find(env_id: str, env_args: Mapping[str, Any] | None) -> tuple[str, EnvSpec
         env_id, spec = find_env(env_id)
         wrappers = ObservationWrappers.take_from(kwargs)
         _check_args(env_id, spec, kwargs)
+    if wrappers.atari is not None:
+        spec = wrappers.atari.limit_outside(spec, kwargs)
     say_each_once()
     return env_id, spec, kwargs, wrappers
 
@@ -268,9 +269,8 @@ def _made(
 
 def _may_be_vectorised(env_id: str, spec: EnvSpec, wrappers: ObservationWrappers) -> bool:
     """Whether a vectorised version, around which there are no wrappers, may observe what they make."""
-    if wrappers.own_process:
-        return False
-    return not (wrappers.observes_images or may_be_masked(_creator(env_id, spec), wrappers.action_mask))
+    is_wrapped = wrappers.own_process or wrappers.observes_images
+    return not (is_wrapped or may_be_masked(_creator(env_id, spec), wrappers.action_mask))
 
 
 def _prepare_pixels(env_id: str, spec: EnvSpec) -> str:

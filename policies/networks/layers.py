@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -22,6 +22,8 @@ OBSERVATION_CLIP = 10.0
 """Normalised observations are clipped to -/+ this."""
 VARIANCE_EPSILON = 1e-8
 """Added to a variance before observations are divided by its square root."""
+_BLOCK = 512
+"""The numbers of an observation that statistics take at once; a multiple of what torch adds up in one instruction."""
 
 _ACTIVATIONS: dict[str, type[nn.Module] | None] = {
     "linear": None, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "elu": nn.ELU, "gelu": nn.GELU,
@@ -211,18 +213,33 @@ class ObservationStatistics:
         if not self._normalizes or num_new == 0:
             return
         batch = self._unmasked(torch.as_tensor(observations, device=self.obs_mean.device))
-        batch = batch.double() * self._observation_scale
-        mean = batch.mean(dim=0)
+        batch = batch.reshape(num_new, self.obs_mean.numel())
+        mean = torch.empty(batch.shape[1], dtype=torch.float64, device=batch.device)
+        deviations = torch.empty_like(mean)
+        for part in column_blocks(batch.shape[1]):
+            block = batch[:, part].to(torch.float64, copy=True).mul_(self._observation_scale)
+            mean[part] = block.mean(dim=0)
+            deviations[part] = block.sub_(mean[part]).square_().sum(dim=0)
+        mean, deviations = mean.reshape(self.obs_mean.shape), deviations.reshape(self.obs_mean.shape)
         count = int(self.obs_count)
         total = count + num_new
         delta = mean - self.obs_mean
-        squares = (
-            self.obs_var.double() * count + ((batch - mean) ** 2).sum(dim=0) + delta**2 * (count * num_new / total)
-        )
+        squares = self.obs_var.double() * count + deviations + delta**2 * (count * num_new / total)
         # In place, because others keep references to these tensors.
         self.obs_mean.copy_(self.obs_mean.double() + delta * (num_new / total))
         self.obs_var.copy_(squares / total)
         self.obs_count.fill_(total)
+
+
+def column_blocks(num_numbers: int) -> Iterator[slice]:
+    """Yield the parts of observations whose statistics are found one after the other, few numbers of all rows at once.
+
+    A batch of bytes in float64 is eight batches. What is left over goes into the last part: a part of a single number
+    would be added up in another order, and rounded otherwise than among others.
+    """
+    num_blocks = max(1, num_numbers // _BLOCK)
+    for index in range(num_blocks):
+        yield slice(index * _BLOCK, (index + 1) * _BLOCK if index + 1 < num_blocks else num_numbers)
 
 
 def observation_scale(space: gym.Space[Any]) -> float:

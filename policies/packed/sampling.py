@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policies.envs.masks import FORBIDDEN
-from policies.networks.layers import OBSERVATION_CLIP, VARIANCE_EPSILON
+from policies.networks.layers import OBSERVATION_CLIP, VARIANCE_EPSILON, column_blocks
 from policies.packed.inputs import Inputs
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, AnyMember
 
@@ -147,13 +147,19 @@ def merge_statistics(member: AnyMember, rows: NDArray[Any], scale: float = 1.0) 
     """Add observations, (B, D), times a scale to a member's statistics, as `ObservationStatistics` does."""
     weights: dict[str, Any] = member.weights
     count, num_new = int(weights[OBS_COUNT]), len(rows)
-    batch = rows.astype(np.float64).reshape(-1, *weights[OBS_MEAN].shape)
-    if scale != 1.0:
-        batch *= scale
-    mean = batch.mean(axis=0)
+    mean, deviations = np.empty(rows.shape[1]), np.empty(rows.shape[1])
+    for part in column_blocks(rows.shape[1]):
+        block = rows[:, part].astype(np.float64)
+        if scale != 1.0:
+            block *= scale
+        own = np.add.reduce(block, axis=0, out=mean[part])
+        own /= num_new
+        block -= own
+        np.add.reduce(np.square(block, out=block), axis=0, out=deviations[part])
+    mean, deviations = (numbers.reshape(weights[OBS_MEAN].shape) for numbers in (mean, deviations))
     total = count + num_new
     delta = mean - weights[OBS_MEAN]
-    squares = weights[OBS_VAR].astype(np.float64) * count + ((batch - mean) ** 2).sum(axis=0)
+    squares = weights[OBS_VAR].astype(np.float64) * count + deviations
     squares += delta**2 * (count * num_new / total)
     weights[OBS_MEAN] = (weights[OBS_MEAN] + delta * (num_new / total)).astype(np.float32)
     weights[OBS_VAR] = (squares / total).astype(np.float32)

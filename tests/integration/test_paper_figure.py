@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -152,6 +152,26 @@ def test_the_leading_settings_are_drawn_with_bands_and_what_tells_them_apart() -
     assert len(labels) == 3
     assert all("lr" in label and "(3 seeds)" in label for label in labels[:2])
     assert labels[2] == "goal 195"
+
+
+def test_curves_of_one_colour_are_told_apart_by_markers() -> None:
+    """Also where they are dashed, and in the legend."""
+    curves = [[[(100, float(score)), (150, float(score))], [(100, 1.0), (200, 2.0)]] for score in range(9)]
+    data = of_settings(*(({"lr": 0.1 * (place + 1)}, seeds) for place, seeds in enumerate(curves)))
+    figure = learning_figure([("mine", data)], top=9)
+    solid, dashed = (
+        [line for line in figure.axes[0].lines if (line.get_linestyle() == "-") == is_solid]
+        for is_solid in (True, False)
+    )
+    handles = [line for line in figure.legends[0].get_lines() if str(line.get_label()).startswith("lr")]
+    for lines in (solid, dashed, handles):
+        looks = [(line.get_color(), line.get_marker()) for line in lines]
+        assert len(looks) == len(set(looks)) == 9
+        assert [marker for _, marker in looks[:6]] == [""] * 6
+        assert "" not in [marker for _, marker in looks[6:]]
+    # A few of them, or they would hide the line.
+    for line in solid[6:]:
+        assert 1 < len(np.asarray(line.get_xdata())[:: cast("int", line.get_markevery())]) < 10
 
 
 def test_a_band_of_few_seeds_does_not_set_the_scale() -> None:

@@ -152,6 +152,12 @@ def test_a_recurrent_module_is_refused_where_it_is_built(build: Build, algorithm
 
 
 @pytest.mark.usefixtures("allowed")
+def test_what_a_module_says_that_is_not_implemented_is_told(build: Build) -> None:
+    with pytest.raises(NotImplementedError, match="of images only"):
+        build("ppo", rl_module=f"{MODULES}:NotOfVectors")
+
+
+@pytest.mark.usefixtures("allowed")
 def test_a_module_that_says_that_it_has_no_state_trains(build: Build) -> None:
     algo, _ = build("ppo", rl_module=f"{MODULES}:OfNoState")
     before = {key: value.clone() for key, value in module_of(algo).state_dict().items()}

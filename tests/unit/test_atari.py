@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from atari_games import ID, NO_OPENCV, needs_opencv, register
+from atari_games import ID, NO_OPENCV, Game, needs_opencv, register
 
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.policy import RandomPolicy
@@ -87,6 +87,31 @@ def test_limits_count_env_steps_and_the_emulators_frames_become_some() -> None:
         env.reset()
         ends = [bool(np.logical_or(*env.step(np.zeros(1, np.int64))[2:4])[0]) for _ in range(8)]
         assert ends.index(True) + 1 == steps
+
+
+@with_opencv
+def test_the_limit_of_the_registry_counts_env_steps_too() -> None:
+    limited = "TestLimitedAtari-v0"
+    register: Any = gym.register
+    register(limited, Game, max_episode_steps=5)
+    try:
+        limits: list[tuple[dict[str, Any], int]] = [
+            ({}, 5), ({"max_episode_steps": 7}, 7), ({"max_num_frames_per_episode": 8}, 2),
+        ]  # fmt: skip
+        for env_args, steps in limits:
+            args = {**NO_NOOPS, **env_args}
+            assert check_env(limited, args).max_episode_steps == steps
+            env, vectors = make_env(limited, args), make_vector_env(limited, args, 1)
+            env.reset()
+            vectors.reset()
+            ends = [env.step(0)[2:4] for _ in range(steps)]
+            theirs = [vectors.step(np.zeros(1, np.int64))[2:4] for _ in range(steps)]
+            assert ends == [(False, False)] * (steps - 1) + [(False, True)]
+            assert [(bool(over[0]), bool(cut[0])) for over, cut in theirs] == ends
+        # Without the preprocessing it is Gymnasium's own.
+        assert check_env(limited, {}).max_episode_steps == 5
+    finally:
+        del gym.registry[limited]
 
 
 @with_opencv
@@ -199,6 +224,7 @@ def test_what_contradicts_itself_is_refused_with_its_place(env: dict[str, Any], 
     [
         ("CartPole-v1", {"atari": {}}, r"CartPole-v1 has env\.atari, but is no game of the Arcade"),
         (ID, {"atari": {}, "frameskip": 4}, r"'frameskip' of TestAtari-v0 is 4.*skipped twice"),
+        (ID, {"atari": {}, "obs_type": "ram"}, r"'obs_type' of TestAtari-v0 is 'ram'.*observes the screen, not"),
         (ID, {"atari": {"frame_skip": "4"}}, r"atari is \{'frame_skip': '4'\}.*whole numbers"),
         (ID, {"atari": True}, r"atari is True; it must be a mapping"),
     ],
@@ -287,6 +313,33 @@ def test_lives_of_the_emulator_are_counted() -> None:
             break
     # Five lives: four are lost, and the game ends with the last.
     assert (lost, ended) == (4, 1)
+
+
+@ale
+def test_a_limit_in_the_registry_counts_env_steps_of_the_emulator() -> None:
+    limited = "TestLimitedPong-v0"
+    gym.register(limited, "ale_py.env:AtariEnv", kwargs={"game": "pong", "frameskip": 4}, max_episode_steps=40)
+    try:
+        args = {"atari": {"noop_max": 0}}
+        assert check_env(limited, args).max_episode_steps == 40
+        env, vectors = make_env(limited, args), make_vector_env(limited, args, 1)
+        env.reset(seed=0)
+        vectors.reset(seed=0)
+        assert [env.step(0)[3] for _ in range(40)].index(True) == 39
+        assert [bool(vectors.step(np.zeros(1, np.int64))[3][0]) for _ in range(40)].index(True) == 39
+    finally:
+        del gym.registry[limited]
+
+
+@ale
+def test_a_game_with_continuous_actions_begins_without_no_ops() -> None:
+    args: dict[str, Any] = {"atari": {}, "continuous": True}
+    for make in (check_env, lambda env_id, args: make_vector_env(env_id, args, 2)):
+        with pytest.raises(EnvError, match=r"env\.atari begins a game with no-ops, up to 30, which") as caught:
+            make("ALE/Pong-v5", args)
+        assert "Set env.atari.noop_max: 0" in caught.value.hint
+    info = check_env("ALE/Pong-v5", {**args, **NO_NOOPS})
+    assert info.action_space.shape == (3,)
 
 
 # -- the plan

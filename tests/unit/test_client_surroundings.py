@@ -55,6 +55,15 @@ def test_what_the_environment_names_and_cannot_be_used_is_told_by_the_variable(
     assert name == "SSL_CERT_FILE" or caught.value.__suppress_context__
 
 
+@pytest.mark.parametrize("url", [URL, "http://tune.invalid"])
+def test_a_proxy_whose_host_no_dns_can_hold_is_told_when_it_is_asked(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    name = f"{url.partition(':')[0].upper()}_PROXY"
+    monkeypatch.setenv(name, "http://ann:s3cret@a..b:1")
+    with Client(url) as client, pytest.raises(SpecError, match=f"The proxy that {name} names") as caught:
+        client.me()
+    assert "s3cret" not in str(caught.value)
+
+
 def test_a_service_of_this_machine_needs_neither(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ALL_PROXY", "socks4://proxy")
     monkeypatch.setenv("SSL_CERT_FILE", "/nonexistent.pem")

@@ -13,9 +13,10 @@ import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 from policy_factory import registered
 
+from analysis.wording import return_text
 from policies.acting import video
 from policies.acting.baselines import ConstantPolicy
 from policies.acting.live import watch_episode
@@ -186,6 +187,42 @@ def test_pictures_of_other_shapes_are_refused(
     assert {step.picture for step in watch_episode(policy(), ENV, {}, 0)[1]} == {None}
     assert list(tmp_path.iterdir()) == []
     assert Grows.num_open == 0
+
+
+def drawn_texts(monkeypatch: pytest.MonkeyPatch, total: float, width: int = 600) -> dict[str, tuple[float, float]]:
+    """The texts of a caption, each with its left and its right end."""
+    ends: dict[str, tuple[float, float]] = {}
+
+    def note(draw: Any, at: tuple[float, float], text: str, *, font: Any, anchor: str, **_: Any) -> None:
+        left, _, right, _ = draw.textbbox(at, text, font=font, anchor=anchor)
+        ends[text] = left, right
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", note)
+    video._captioned(video._Panel(Image.new("RGB", (width, 400)), "me " * 90, 7, total, over=False), 1.0)
+    return ends
+
+
+@pytest.mark.parametrize(
+    ("total", "shown"),
+    [
+        (0.955, "0.955"), (-0.04, "-0.040"), (200.0, "200"), (0.0, "0"), (-0.0, "0"), (-3, "-3"), (1.999, "1.999"),
+        (195.04, "195.0"), (-0.00123, "-0.00123"), (1.5e-12, "1.5e-12"), (-np.inf, "-inf"), (np.nan, "nan"),
+    ],
+)  # fmt: skip
+def test_a_film_tells_a_return_as_reports_do(monkeypatch: pytest.MonkeyPatch, total: float, shown: str) -> None:
+    assert f"return {shown}" in drawn_texts(monkeypatch, total)
+    if total and np.isfinite(total) and not float(total).is_integer():
+        assert shown == return_text(total)
+
+
+@pytest.mark.parametrize("width", [330, 600])
+def test_no_words_move_or_meet_while_a_small_return_grows(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    places = []
+    for total in (0.0, 0.955, -0.955, 1.5, -200.0):
+        (title, step, told) = sorted(drawn_texts(monkeypatch, total, width).values())
+        assert title[1] < step[0] < step[1] < told[0] < told[1] < width
+        places.append((title, step))
+    assert len(set(places)) == 1
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,10 @@ from analysis.importance import what_mattered
 from analysis.page.narrowed import narrowed_space
 from analysis.page.repeat import _domain
 from analysis.points import IDLE, searched_names, setting_labels, value_text
-from analysis.report_tables import group_table, trial_table
+from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
+from analysis.report_tables import group_table, steps_table, trial_table
 from analysis.tables import csv_text
-from analysis.wording import number, setting_text, short_text
+from analysis.wording import NONE, number, setting_text, short_text
 from tune_jobs.cli.plan_view import _plan_table
 from tune_jobs.cli.trials_table import print_table
 from tune_jobs.plan.machine import Machine
@@ -134,6 +135,39 @@ def test_the_report_has_empty_cells(made: Synthetic) -> None:
     groups = group_table(made.trials, made.results, ["replay", "n_step"], goal=None)
     assert sorted(row[1].text for row in groups.rows) == ["", "2", "3"]
     assert setting_labels(POINTS[:2])[0] == "replay uniform, lr 0.001"
+
+
+def test_the_report_tells_a_searched_null_from_what_does_not_act() -> None:
+    points: list[dict[str, Any]] = [
+        {"grad_clip": None, "activation": "tanh"}, {"grad_clip": 0.5, "activation": "tanh"},
+        {"activation": "tanh"}, {"activation": "relu"},
+    ]  # fmt: skip
+    trials, results = [], {}
+    for index, (point, score) in enumerate(zip(points, (10.0, 50.0, 500.0, 20.0), strict=True)):
+        trial_id = f"t{index:04d}"
+        kept = CheckpointRecord(trial_id=trial_id, iteration=1, num_env_steps=100, evaluation_return=score)
+        trials.append(
+            TrialRecord(
+                trial_id=trial_id, index=index, point_index=index, seed=index, point=point, status="completed",
+                checkpoints=(kept,),
+            )
+        )  # fmt: skip
+        results[trial_id] = [
+            IterationRecord(iteration=1, num_env_steps=100, num_episodes=200, time_s=1.0, training_return=score)
+        ]
+    groups = group_table(trials, results, ["grad_clip", "activation"], goal=None)
+    assert groups.headings == ["grad_clip", "activation", "trials", "failed", "best score", "mean score"]
+    assert [[row[at].text for at in (0, 1, 2, 5)] for row in groups.rows] == [
+        ["", "tanh", "1", "500.0"],
+        ["0.5", "tanh", "1", "50.0"],
+        ["", "relu", "1", "20.0"],
+        [NONE, "tanh", "1", "10.0"],
+    ]
+    steps = steps_table(trials, results, goal=5.0)
+    assert steps.headings[:2] == ["grad_clip", "activation"]
+    assert [[cell.text for cell in row[:2]] for row in steps.rows] == [
+        [NONE, "tanh"], ["0.5", "tanh"], ["", "tanh"], ["", "relu"]
+    ]  # fmt: skip
 
 
 def test_axes_have_no_place_for_it(made: Synthetic) -> None:

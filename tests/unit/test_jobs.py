@@ -1,6 +1,7 @@
 """Ray's Jobs API is asked as Ray asks it, and whatever else answers is told in one sentence."""
 
 import socket
+import sys
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -8,8 +9,10 @@ from pathlib import Path
 import pytest
 from fake_jobs import Head, head
 
-from policies.errors import CannotRunError, SpecError
+from analysis.records import JobRecord
+from policies.errors import CannotRunError, SpecError, TuneJobsError
 from tune_jobs.ray_tune.jobs import JobsApi, check_jobs_address, token_of
+from tune_jobs.sweeps.detached import job_now
 
 __all__ = ["head"]
 
@@ -122,3 +125,39 @@ def test_what_never_answers_is_given_up_and_a_closed_port_names_the_dashboard() 
 class _Quiet(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002 (the name that is overridden)
         pass
+
+
+LONG = "a" * 70
+
+
+@pytest.mark.parametrize(
+    ("address", "name", "value", "words"),
+    [
+        ("http://a..b:8265", None, "", "http://a..b:8265"),
+        (f"http://{LONG}.invalid:8265", None, "", f"http://{LONG}.invalid:8265"),
+        ("http://head.invalid:8265", "SSL_CERT_FILE", "/nonexistent.pem", "SSL_CERT_FILE"),
+        ("http://head.invalid:8265", "HTTP_PROXY", "foo://x:1", "HTTP_PROXY names has the scheme foo"),
+        ("http://head.invalid:8265", "HTTP_PROXY", "http://u:sec/ret@p:1", "HTTP_PROXY names has no address"),
+        ("http://head.invalid:8265", "HTTP_PROXY", "http://u:secret@a..b:1", "HTTP_PROXY names has no address"),
+        ("https://head.invalid:8265", "ALL_PROXY", "socks5://u:secret@x:1", "needs socksio"),
+    ],
+)
+def test_odd_hosts_proxies_and_certificates_are_told_and_make_no_sweep_unreadable(
+    monkeypatch: pytest.MonkeyPatch, address: str, name: str | None, value: str, words: str
+) -> None:
+    for variable in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY"):
+        monkeypatch.delenv(variable, raising=False)
+        monkeypatch.delenv(variable.lower(), raising=False)
+    monkeypatch.setitem(sys.modules, "socksio", None)
+    if name is not None:
+        monkeypatch.setenv(name, value)
+
+    def ask() -> None:
+        with JobsApi(address) as api:
+            api.ray_version()
+
+    with pytest.raises(TuneJobsError) as caught:
+        ask()
+    assert words in str(caught.value)
+    assert "sec" not in str(caught.value)
+    assert job_now(JobRecord(id="mine-1", address=address, place="")) is None

@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 from fake_jobs import Head, head
 from sweep_folders import make_sweep_folder
 
-from analysis.records import JobRecord
+from analysis.records import JobRecord, SweepState
 from policies.errors import CannotRunError
 from tune_jobs.cli.commands import cli
 from tune_jobs.ray_tune import known_clusters
@@ -215,4 +215,14 @@ def elsewhere(head: Head) -> Iterator[str]:
 def test_a_redirect_is_not_followed(head: Head, elsewhere: str) -> None:
     with JobsApi(elsewhere) as api, pytest.raises(CannotRunError, match="it answers 307"):
         api.ray_version()
+    assert head.shown == []
+
+
+@pytest.mark.parametrize("found", ["completed", "interrupted"])
+def test_a_sweep_that_was_driven_is_not_running_whoever_its_record_names(
+    head: Head, got: SweepStore, found: SweepState
+) -> None:
+    got.write_record(got.read_record().model_copy(update={"state": found}))
+    result = run("stop", "got")
+    assert (result.exit_code, result.stdout.strip()) == (0, "got is not running.")
     assert head.shown == []

@@ -196,6 +196,26 @@ def test_the_largest_number_of_random_play_is_behind_the_mask(monkeypatch: pytes
     assert measure_step("TestMaskedShades-v0", {}).largest == 0.0
 
 
+@pytest.mark.parametrize(
+    ("sweep", "is_told"),
+    [
+        ({"space": {"conv_filters": {"choice": [[[4, 3, 2]], [[8, 3, 2]]]}}}, False),
+        ({"space": {"conv_filters": {"choice": [[[4, 3, 2]], None]}}}, True),
+        ({"hyperparams": FILTERS}, False),
+        (PLAIN, True),
+    ],
+    ids=str,
+)
+def test_bytes_beside_others_are_large_unless_every_trial_has_convolutions(
+    sweep: dict[str, Any], *, is_told: bool
+) -> None:
+    spec = load_spec({"env": {"id": "TestBeside-v0"}, "algorithm": "ppo", **sweep})
+    info = check_env("TestBeside-v0", {})
+    assert present(info.largest).place.startswith("observation['image'][")
+    notes = [note for note in env_notes(spec, info) if "as large as" in note]
+    assert len(notes) == (1 if is_told else 0)
+
+
 def on_rewards(reward: float | None, algorithm: str = "dqn", env_id: str = "CartPole-v1", **sweep: Any) -> list[str]:
     spec = load_spec({"env": {"id": env_id}, "algorithm": algorithm, **sweep})
     packs = PackPlan(1, 1, 1.0, 0.0, (), "scalar", 5.0, 0, reward=reward)
@@ -218,6 +238,15 @@ def test_dqn_is_told_of_large_rewards_with_what_scales_them(reward: float, shown
     assert on_rewards(reward, "ppo") == []
     assert on_rewards(reward, hyperparams={"reward_scale": float(scale)}) == []
     assert on_rewards(reward, space={"reward_scale": {"loguniform": [1e-5, 1]}}) == []
+
+
+@pytest.mark.parametrize(("atari", "is_told"), [(True, False), ({"clip_rewards": False}, True)])
+def test_rewards_that_training_sees_as_signs_are_not_large(atari: Any, *, is_told: bool) -> None:
+    # The file alone tells what training sees.
+    spec = load_spec({"env": {"id": "CartPole-v1", "atari": atari}, "algorithm": "dqn"})
+    packs = PackPlan(1, 1, 1.0, 0.0, (), "scalar", 5.0, 0, reward=6.0)
+    notes = [note for note in env_notes(spec, check_env("CartPole-v1", {}), packs) if "reward_scale" in note]
+    assert len(notes) == (1 if is_told else 0)
 
 
 def test_dqn_is_not_told_of_usual_rewards() -> None:

@@ -9,7 +9,8 @@ import pytest
 from policy_factory import registered
 
 from policies.envs.make import check_env, make_env
-from policies.errors import EnvError
+from tune_jobs.plan.env_notes import env_notes
+from tune_jobs.spec.sweep_spec import SweepSpec
 
 ENV = "TestCar-v0"
 
@@ -28,6 +29,14 @@ class Unlimited(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(gym.make("MountainCar-v0", max_episode_steps=-1))
 
 
+class GoesOn(Around):
+    """A wrapper whose episodes don't end where those inside do."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        seen, reward, terminated, _, info = self.env.step(action)
+        return seen, reward, terminated, False, info
+
+
 def played(args: dict[str, Any] | None) -> int:
     env = make_env(ENV, args)
     env.reset(seed=0)
@@ -39,8 +48,11 @@ def played(args: dict[str, Any] | None) -> int:
 
 @pytest.mark.parametrize(
     ("kind", "asked", "limit"),
-    [(Around, None, 200), (Around, 100, 100), (Around, 200, 200), (Unlimited, None, None), (Unlimited, 300, 300)],
-)
+    [
+        (Around, None, 200), (Around, 100, 100), (Around, 200, 200), (Around, 300, 200),
+        (Unlimited, None, None), (Unlimited, 300, 300), (GoesOn, None, None), (GoesOn, 300, 300), (GoesOn, 100, 100),
+    ],
+)  # fmt: skip
 def test_the_limit_is_that_which_acts(kind: type[gym.Env[Any, Any]], asked: int | None, limit: int | None) -> None:
     args = None if asked is None else {"max_episode_steps": asked}
     with registered(ENV, kind):
@@ -48,8 +60,18 @@ def test_the_limit_is_that_which_acts(kind: type[gym.Env[Any, Any]], asked: int 
         assert played(args) == (limit or 400)
 
 
-def test_a_limit_that_never_acts_is_refused() -> None:
-    with registered(ENV, Around):
-        with pytest.raises(EnvError, match=r"'max_episode_steps' of TestCar-v0 is 1,000, .* 200 env steps") as caught:
-            check_env(ENV, {"max_episode_steps": 1000})
-        assert "max_episode_steps=-1" in str(caught.value.hint)
+@pytest.mark.parametrize(
+    ("kind", "asked", "is_noted"), [(Around, 1000, True), (Around, 200, False), (GoesOn, 1000, False)]
+)
+def test_the_plan_notes_a_limit_that_never_acts(kind: type[gym.Env[Any, Any]], asked: int, is_noted: bool) -> None:
+    spec = SweepSpec.model_validate(
+        {
+            "env": {"id": ENV, "args": {"max_episode_steps": asked}},
+            "algorithm": "ppo",
+            "space": {"lr": {"grid": [1e-3]}},
+        }
+    )
+    with registered(ENV, kind):
+        notes = list(env_notes(spec, check_env(ENV, spec.env.args)))
+    told = "env.args.max_episode_steps 1,000 never acts: TestCar-v0 cuts off episodes after 200 env steps by itself."
+    assert any(told in note for note in notes) == is_noted

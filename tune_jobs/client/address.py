@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -40,15 +39,6 @@ def service_url(text: str) -> str:
     if parts.scheme not in ("http", "https") or not parts.hostname or any(part.isspace() for part in text):
         raise SpecError(f"The service's address {text[:200]!r} does not begin with http:// or https://.", _EXAMPLE)
     return text.rstrip("/")
-
-
-def is_this_machine(url: str) -> bool:
-    """Whether an address is one of this machine alone, by its text."""
-    host = urlsplit(url).hostname or ""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost" or host.endswith(".localhost")
 
 
 def token_of(token: str | None, file: str | Path | None) -> str | None:

@@ -5,16 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import ssl
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from policies.errors import CannotRunError, SpecError, TuneJobsError, said_by
-from tune_jobs.client.address import is_this_machine
+from policies.errors import CannotRunError, SpecError, said_by
 from tune_jobs.client.problems import (
     LostConnectionError,
     NoServiceError,
@@ -23,6 +20,7 @@ from tune_jobs.client.problems import (
     refusal,
     unreachable,
 )
+from tune_jobs.process.http_client import http_client, is_this_machine, wrong_proxy
 
 if TYPE_CHECKING:
     import httpx2
@@ -33,7 +31,6 @@ CONNECT_S = 10.0
 _WAITS_S = (0.2, 0.5, 1.0, 2.0)
 """How long is waited before each further attempt."""
 JSON = "application/json"
-_PROXY_SCHEMES = ("http", "https", "socks5", "socks5h")
 Query = Mapping[str, str | int | float | bool | Sequence[str] | None]
 
 
@@ -64,23 +61,13 @@ class Connection:
             if url.startswith("http:") and not is_this_machine(url):
                 _log.warning("The token is sent to %s without TLS: whoever listens on the network reads it.", url)
         trusted = _trusted(url, ca_file)
-        try:
-            self._http = httpx2.Client(
-                headers=headers,
-                timeout=httpx2.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
-                verify=trusted,
-                follow_redirects=False,
-                # A proxy of the environment can't reach this machine's own services.
-                trust_env=not is_this_machine(url),
-            )
-        except OSError as error:
-            raise _unread_certificates(error) from error
-        except (ImportError, ValueError, httpx2.InvalidURL):
-            wrong = _wrong_proxy()
-            if wrong is None:
-                raise
-            # Not from the error, whose text may have a part of the proxy's password in it.
-            raise wrong from None
+        self._http = http_client(
+            url,
+            headers=headers,
+            timeout=httpx2.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
+            verify=trusted,
+            ca_hint="name a file of them by --ca-file (in Python ca_file=)",
+        )
 
     def close(self) -> None:
         """Close all connections."""
@@ -213,7 +200,9 @@ class Connection:
         except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.UnsupportedProtocol) as error:
             raise unreachable(self.url, error, self._ca_file) from error
         except (httpx2.ProxyError, httpx2.InvalidURL, UnicodeError) as error:
-            # That of Unicode is of a host's name that the DNS can't hold, such as a..b.
+            # That of Unicode is of a host's name that the DNS can't hold, such as a..b, be it that of a proxy.
+            if isinstance(error, UnicodeError) and (wrong := wrong_proxy(self.url)):
+                raise wrong from None
             raise unreachable(self.url, error, self._ca_file) from error
         except httpx2.HTTPError as error:
             known = (
@@ -243,53 +232,3 @@ def _trusted(url: str, ca_file: str | Path | None) -> ssl.SSLContext | bool:
         # Nothing of TLS is used; to read the certificates that are trusted takes longer than most requests.
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     return True
-
-
-def _unread_certificates(error: OSError) -> SpecError:
-    """Return the error for certificates that this machine trusts and that can't be read."""
-    why = error.strerror or said_by(error)
-    name = next((name for name in ("SSL_CERT_FILE", "SSL_CERT_DIR") if os.environ.get(name)), None)
-    if name is None:
-        return SpecError(
-            f"The certificates that this machine trusts can't be read: {why}.",
-            "Name a file of certificates, PEM, by --ca-file (in Python ca_file=).",
-        )
-    return SpecError(
-        f"The certificates that {name} names, in {os.environ[name]}, can't be read: {why}.",
-        f"Have {name} name certificates, PEM, or unset it; or name a file of them by --ca-file (in Python ca_file=).",
-    )
-
-
-def _wrong_proxy() -> TuneJobsError | None:
-    """Return the error for a proxy of the environment that can't be used; None: all can.
-
-    Of its address nothing is shown but a scheme that isn't known: the rest may have a password in it.
-    """
-    from urllib.request import getproxies_environment
-
-    import httpx2
-
-    for kind, text in getproxies_environment().items():
-        if kind not in ("http", "https", "all"):
-            continue
-        name = f"{kind}_proxy" if f"{kind}_proxy" in os.environ else f"{kind.upper()}_PROXY"
-        url = text if "://" in text else f"http://{text}"
-        scheme = url.partition("://")[0].lower()
-        hint = f"Have {name} name one as http://HOST:PORT, or unset it."
-        if scheme.isalnum() and scheme not in _PROXY_SCHEMES:
-            return SpecError(
-                f"The proxy that {name} names has the scheme {scheme}; known are {', '.join(_PROXY_SCHEMES)}.", hint
-            )
-        try:
-            httpx2.Proxy(url)
-        except (ValueError, httpx2.InvalidURL):
-            return SpecError(
-                f"The proxy that {name} names has no address of a host and port (not shown: it may hold a password).",
-                hint,
-            )
-        if scheme.startswith("socks") and find_spec("socksio") is None:
-            return CannotRunError(
-                f"The proxy that {name} names speaks SOCKS, which needs socksio, and that is not installed.",
-                f"Install it with `pip install socksio`, or: {hint[0].lower()}{hint[1:]}",
-            )
-    return None

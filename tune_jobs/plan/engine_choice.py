@@ -120,14 +120,15 @@ def _convolutions(spec: SweepSpec, hyperparams: Hyperparams | None, env: EnvInfo
     if hyperparams is not None:
         filters = None if isinstance(hyperparams, RandomHyperparams) else hyperparams.conv_filters
     else:
-        filters = next((found for found in _possible_filters(spec) if found is not None), None)
+        filters = next((found for found in possible_filters(spec) if found is not None), None)
     if filters is not None:
         yield f"conv_filters is {[list(one) for one in filters]}"
     if env is not None and env.observes_images:
         yield f"{env.env_id} has images as observations"
 
 
-def _possible_filters(spec: SweepSpec) -> list[Any]:
+def possible_filters(spec: SweepSpec) -> list[Any]:
+    """Return the conv_filters that trials of a sweep may have; None among them: a trial without convolutions."""
     domain: Domain | None = spec.space.get("conv_filters")
     if domain is None:
         return [spec.hyperparams.get("conv_filters")]

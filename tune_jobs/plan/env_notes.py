@@ -91,6 +91,13 @@ def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterat
                 f"{duration(longest_s)}. Each evaluation plays {counted(spec.evaluation.num_episodes, 'episode')}, the "
                 "end of the sweep more; env.args.max_episode_steps sets a limit."
             )
+    asked = spec.env.args.get("max_episode_steps")
+    if isinstance(asked, int) and env.max_episode_steps is not None and env.max_episode_steps < asked:
+        yield (
+            f"env.args.max_episode_steps {asked:,} never acts: {env.env_id} cuts off episodes after "
+            f"{env.max_episode_steps:,} env steps by itself. A wrapper around an environment of gymnasium.make has a "
+            "limit inside, which max_episode_steps=-1 leaves out there."
+        )
     target = spec.stop.training_return
     if env.threshold is not None and target is not None and target < env.threshold:
         yield (

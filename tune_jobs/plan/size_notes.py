@@ -17,7 +17,7 @@ from policies.envs.flat import named
 from policies.envs.images import image_members
 from policies.envs.make import EnvInfo
 from policies.envs.masks import seen_by_networks
-from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.plan.engine_choice import PackPlan, possible_filters
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 _FEW_TIMES = 20
@@ -45,7 +45,8 @@ def size_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None) -> Iterato
             yield from _on_bytes(env.env_id, abs(env.largest.value), highest)
         else:
             yield from _on_numbers(env.env_id, env.largest, None if packs is None else packs.largest)
-    is_scaled = _SCALE in spec.space or _SCALE in spec.hyperparams
+    is_clipped = spec.env.atari is not None and spec.env.atari.clip_rewards
+    is_scaled = is_clipped or _SCALE in spec.space or _SCALE in spec.hyperparams
     if spec.algorithm == "dqn" and packs is not None and packs.reward is not None and not is_scaled:
         yield from _on_rewards(env.env_id, packs.reward)
 
@@ -53,9 +54,9 @@ def size_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None) -> Iterato
 def _highest_of_convolved(spec: SweepSpec, env: EnvInfo, largest: Largest) -> int | None:
     """Return the most that bytes may be which convolutions see, if the largest number is one of them; None: it is not.
 
-    As a member beside others, these are divided by it only where convolutions see them.
+    As a member beside others, these are divided by it only where convolutions see them: in every trial of the sweep.
     """
-    if env.image is None or not spec.hyperparams.get("conv_filters"):
+    if env.image is None or not all(possible_filters(spec)):
         return None
     for keys, part in zip(image_members(env.observation_space), env.image.parts, strict=False):
         if largest.place.startswith(named(keys)) and part.scale != 1.0:

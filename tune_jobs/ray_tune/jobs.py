@@ -17,6 +17,7 @@ from urllib.parse import quote, urlsplit
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from policies.errors import CannotRunError, SpecError, fit, said_by
+from tune_jobs.process.http_client import http_client, wrong_proxy
 
 if TYPE_CHECKING:
     import httpx2
@@ -26,7 +27,6 @@ ENDED: frozenset[JobState] = frozenset({"STOPPED", "SUCCEEDED", "FAILED"})
 
 _TIMEOUT_S = 30.0
 _MAX_SAID = 300
-_HERE = ("localhost", "127.0.0.1", "::1")
 _WHERE = (
     "Give the address of the head's dashboard, mostly http://HEAD:8265. Ports 6379 (nodes) and 10001 (ray:// clients) "
     "are others."
@@ -120,18 +120,11 @@ class JobsApi:
     """
 
     def __init__(self, address: str, *, timeout_s: float = _TIMEOUT_S) -> None:
-        import httpx2
 
         self.address = check_jobs_address(address)
         token = token_of(os.environ)
-        self._http = httpx2.Client(
-            headers={} if token is None else {"Authorization": f"Bearer {token}"},
-            timeout=timeout_s,
-            # Nobody has named where a redirect leads.
-            follow_redirects=False,
-            # A proxy of the environment can't reach this machine's own Ray.
-            trust_env=urlsplit(self.address).hostname not in _HERE,
-        )
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._http = http_client(self.address, headers=headers, timeout=timeout_s)
         self.shows_token = token is not None
 
     def __enter__(self) -> Self:
@@ -238,7 +231,10 @@ class JobsApi:
             raise CannotRunError(
                 f"{self.address} does not answer in time.", f"See whether the cluster is well. {_WHERE}"
             ) from error
-        except (httpx2.HTTPError, httpx2.InvalidURL) as error:
+        except (httpx2.HTTPError, httpx2.InvalidURL, UnicodeError) as error:
+            # That of Unicode is of a host's name that the DNS can't hold, such as a..b, be it that of a proxy.
+            if isinstance(error, UnicodeError) and (wrong := wrong_proxy(self.address)):
+                raise wrong from None
             raise self._not_ray(said_by(error) or type(error).__name__) from error
         if answer.status_code in (401, 403):
             shown = "does not accept this machine's token" if self.shows_token else "wants a token"

@@ -6,6 +6,7 @@ import importlib.util
 import math
 import sqlite3
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +29,8 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
     A trial's value is what settings are judged by, `objective` in the sweep file, and higher is better. Its evaluations
     are intermediate values, by env steps. One that the sweep's scheduler ended is pruned; one that failed, or showed
     nothing to be judged by, has failed. Lists, such as hidden sizes, are texts; layers that are searched one by one are
-    a number and a size of each. A trial lacks what does not act in it, as Optuna has it. Seeds, returns and the point
-    that a trial shares with others are user attributes.
+    a number and a size of each. A trial lacks what does not act in it, as Optuna has it. It began and ended when the
+    sweep's did. Seeds, returns and the point that a trial shares with others are user attributes.
 
     Args:
         spec: The sweep.
@@ -130,7 +131,7 @@ def _as_optunas(
         told = {"state": states.PRUNED if pruned else states.COMPLETE, "value": score}
     parts = Parts(spec.space)
     values = parts.known_values_of(trial.point)
-    return optuna.trial.create_trial(
+    made = optuna.trial.create_trial(
         params={key: _value(domain, values[key]) for key, domain in parts.space.items() if key in values},
         distributions={key: distributions[key] for key in values},
         intermediate_values={
@@ -139,6 +140,20 @@ def _as_optunas(
         user_attrs=_attributes(trial),
         **told,
     )
+    # Where it is not known, the moment of the export remains: Optuna has no finished trial without one.
+    if (ended := _local_time(trial.ended_at)) is not None:
+        made.datetime_start, made.datetime_complete = _local_time(trial.started_at) or ended, ended
+    return made
+
+
+def _local_time(unix_time: float | None) -> datetime | None:
+    """Return a moment in Optuna's form, local time without its zone; None: it is not known, or not a valid time."""
+    if unix_time is None:
+        return None
+    try:
+        return datetime.fromtimestamp(unix_time, tz=UTC).astimezone().replace(tzinfo=None)
+    except (ValueError, OverflowError, OSError):
+        return None
 
 
 def _attributes(trial: TrialRecord) -> dict[str, Any]:

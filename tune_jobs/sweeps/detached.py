@@ -239,11 +239,14 @@ def cancel_waiting(store: Sweep) -> bool:
     Raises:
         CannotRunError: Its cluster is not asked, see `why_not_asked`, or refuses to end it.
     """
-    job = job_of(store.read_record(), store.place)
+    record = store.read_record()
+    job = job_of(record, store.place)
     if job is None:
         return False
     refused = why_not_asked(job)
     if refused is not None:
+        if record.state not in ("created", "running"):
+            return False  # it has been driven, and so has the job that its record names
         raise refused
     found = job_now(job)
     if found is None or found.has_ended:

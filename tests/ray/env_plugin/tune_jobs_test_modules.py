@@ -68,6 +68,13 @@ class RecurrentDQN(OwnDQN):
         return {"h": torch.zeros(4)}
 
 
+class NotOfVectors(OwnPPO):
+    """Can't be built."""
+
+    def setup(self) -> None:
+        raise NotImplementedError("of images only")
+
+
 class OfNoState(OwnPPO):
     """Says itself that it is not recurrent."""
 
