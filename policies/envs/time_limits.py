@@ -5,24 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import AtariPreprocessing, TimeLimit
 
 _PASS_ON = ("gymnasium", "policies")
-"""Whose wrappers make one step of the environment for one of their own, and end an episode where it does, at least."""
+"""Whose steps are one step of the environment inside each, and end an episode where it does, at least."""
 
 
 def time_limit_of(env: gym.Env[Any, Any]) -> int | None:
     """Return the number of env steps after which an episode is truncated, the least of the limits around the env.
 
     An environment that is a wrapper around one of `gymnasium.make` has that one's limit inside, which goes on to act
-    when a larger one is set around both. Where such a wrapper makes steps of its own, it may go on after an episode
-    that ends inside, or make several steps of one: limits inside it say nothing of its episodes.
+    when a larger one is set around both. A wrapper whose `step` is its own may go on after an episode that ends inside,
+    or make several steps of one: if there is a limit around it, those inside it say nothing.
 
     Args:
         env: The environment with all its wrappers; those in a process of its own are not seen.
     """
-    # What `env.spec` says is also a limit's from inside, whatever is around it.
-    limits: list[int] = []
+    # That of the outermost limit, be it inside a wrapper that does whatever it likes: most only look at what passes.
+    limits = [] if env.spec is None or env.spec.max_episode_steps is None else [env.spec.max_episode_steps]
     inner: gym.Env[Any, Any] = env
     while isinstance(inner, gym.Wrapper) and _passes_on(type(inner)):
         if isinstance(inner, TimeLimit):
@@ -32,5 +32,5 @@ def time_limit_of(env: gym.Env[Any, Any]) -> int | None:
 
 
 def _passes_on(wrapper: type[gym.Wrapper[Any, Any, Any, Any]]) -> bool:
-    is_known = wrapper.__module__.partition(".")[0] in _PASS_ON
-    return is_known or wrapper.step is gym.Wrapper.step
+    # Gymnasium's preprocessing of Atari games takes several frames a step.
+    return not issubclass(wrapper, AtariPreprocessing) and wrapper.step.__module__.partition(".")[0] in _PASS_ON

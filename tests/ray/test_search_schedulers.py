@@ -316,8 +316,8 @@ def test_a_run_is_kept_with_its_schedules_and_failures_as_null() -> None:
 
 def test_tables_have_a_column_for_each_method_that_has_runs_and_ranks_of_those_that_have_all() -> None:
     def kept(*values: float) -> dict[str, Any]:
-        runs = [{"scores": [value], "best": {}, "test": value} for value in values]
-        return {"date": "2026-11-23", "machine": "a machine", "runs": runs}
+        made = {"date": "2026-11-23", "machine": "a machine"}
+        return {"runs": [{**made, "scores": [value], "best": {}, "test": value} for value in values]}
 
     first, second = "cartpole-ppo", "pendulum-ppo"
     found = {(task, method): kept(1, 2) for task in (first, second) for method in ("random", "gp")}

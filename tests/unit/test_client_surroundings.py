@@ -55,13 +55,24 @@ def test_what_the_environment_names_and_cannot_be_used_is_told_by_the_variable(
     assert name == "SSL_CERT_FILE" or caught.value.__suppress_context__
 
 
+@pytest.mark.parametrize("proxy", ["http://ann:s3cret@a..b:1", "http://:8080", "http://"])
 @pytest.mark.parametrize("url", [URL, "http://tune.invalid"])
-def test_a_proxy_whose_host_no_dns_can_hold_is_told_when_it_is_asked(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+def test_a_proxy_that_has_no_host_is_told_when_it_is_asked(
+    monkeypatch: pytest.MonkeyPatch, url: str, proxy: str
+) -> None:
     name = f"{url.partition(':')[0].upper()}_PROXY"
-    monkeypatch.setenv(name, "http://ann:s3cret@a..b:1")
+    monkeypatch.setenv(name, proxy)
     with Client(url) as client, pytest.raises(SpecError, match=f"The proxy that {name} names") as caught:
         client.me()
     assert "s3cret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["HTTPS_PROXY", "HTTP_PROXY"])
+def test_a_proxy_that_is_not_asked_is_not_blamed(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv(name, "http://a..b:1")
+    monkeypatch.setenv("NO_PROXY", "x..y" if name == "HTTP_PROXY" else "")
+    with Client("http://x..y:8470") as client, pytest.raises(NoServiceError, match=r"at http://x\.\.y:8470 can't be"):
+        client.me()
 
 
 def test_a_service_of_this_machine_needs_neither(monkeypatch: pytest.MonkeyPatch) -> None:

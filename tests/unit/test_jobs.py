@@ -139,6 +139,8 @@ LONG = "a" * 70
         ("http://head.invalid:8265", "HTTP_PROXY", "foo://x:1", "HTTP_PROXY names has the scheme foo"),
         ("http://head.invalid:8265", "HTTP_PROXY", "http://u:sec/ret@p:1", "HTTP_PROXY names has no address"),
         ("http://head.invalid:8265", "HTTP_PROXY", "http://u:secret@a..b:1", "HTTP_PROXY names has no address"),
+        ("http://head.invalid:8265", "HTTP_PROXY", "http://:8080", "HTTP_PROXY names has no address"),
+        ("http://a..b:8265", "HTTPS_PROXY", "http://x..y:1", "http://a..b:8265"),
         ("https://head.invalid:8265", "ALL_PROXY", "socks5://u:secret@x:1", "needs socksio"),
     ],
 )

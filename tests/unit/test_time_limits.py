@@ -29,6 +29,24 @@ class Unlimited(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(gym.make("MountainCar-v0", max_episode_steps=-1))
 
 
+class Seen(gym.ObservationWrapper[Any, Any, Any]):
+    """What is seen is changed, which leaves `step` to Gymnasium."""
+
+    def __init__(self) -> None:
+        super().__init__(gym.make("MountainCar-v0"))
+
+    def observation(self, observation: Any) -> Any:
+        return -observation
+
+
+class Paid(Around):
+    """A wrapper with a step of its own, which passes on where episodes end."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        return seen, float(reward) - 1.0, terminated, truncated, info
+
+
 class GoesOn(Around):
     """A wrapper whose episodes don't end where those inside do."""
 
@@ -50,7 +68,8 @@ def played(args: dict[str, Any] | None) -> int:
     ("kind", "asked", "limit"),
     [
         (Around, None, 200), (Around, 100, 100), (Around, 200, 200), (Around, 300, 200),
-        (Unlimited, None, None), (Unlimited, 300, 300), (GoesOn, None, None), (GoesOn, 300, 300), (GoesOn, 100, 100),
+        (Unlimited, None, None), (Unlimited, 300, 300), (GoesOn, 300, 300), (GoesOn, 100, 100),
+        (Seen, None, 200), (Seen, 300, 200), (Seen, 100, 100), (Paid, None, 200),
     ],
 )  # fmt: skip
 def test_the_limit_is_that_which_acts(kind: type[gym.Env[Any, Any]], asked: int | None, limit: int | None) -> None:
@@ -61,7 +80,8 @@ def test_the_limit_is_that_which_acts(kind: type[gym.Env[Any, Any]], asked: int 
 
 
 @pytest.mark.parametrize(
-    ("kind", "asked", "is_noted"), [(Around, 1000, True), (Around, 200, False), (GoesOn, 1000, False)]
+    ("kind", "asked", "is_noted"),
+    [(Around, 1000, True), (Seen, 1000, True), (Around, 200, False), (GoesOn, 1000, False)],
 )
 def test_the_plan_notes_a_limit_that_never_acts(kind: type[gym.Env[Any, Any]], asked: int, is_noted: bool) -> None:
     spec = SweepSpec.model_validate(

@@ -197,11 +197,12 @@ class Connection:
 
         try:
             yield
-        except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.UnsupportedProtocol) as error:
-            raise unreachable(self.url, error, self._ca_file) from error
-        except (httpx2.ProxyError, httpx2.InvalidURL, UnicodeError) as error:
+        except (
+            httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.UnsupportedProtocol, httpx2.ProxyError,
+            httpx2.InvalidURL, UnicodeError,
+        ) as error:  # fmt: skip
             # That of Unicode is of a host's name that the DNS can't hold, such as a..b, be it that of a proxy.
-            if isinstance(error, UnicodeError) and (wrong := wrong_proxy(self.url)):
+            if wrong := wrong_proxy(self.url):
                 raise wrong from None
             raise unreachable(self.url, error, self._ca_file) from error
         except httpx2.HTTPError as error:

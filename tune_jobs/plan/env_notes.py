@@ -93,10 +93,15 @@ def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterat
             )
     asked = spec.env.args.get("max_episode_steps")
     if isinstance(asked, int) and env.max_episode_steps is not None and env.max_episode_steps < asked:
+        where = (
+            "A wrapper around an environment of gymnasium.make has a limit inside, which max_episode_steps=-1 leaves "
+            "out there."
+            if spec.env.atari is None
+            else "The emulator ends a game after max_num_frames_per_episode frames, which env.args may set."
+        )
         yield (
             f"env.args.max_episode_steps {asked:,} never acts: {env.env_id} cuts off episodes after "
-            f"{env.max_episode_steps:,} env steps by itself. A wrapper around an environment of gymnasium.make has a "
-            "limit inside, which max_episode_steps=-1 leaves out there."
+            f"{env.max_episode_steps:,} env steps by itself. {where}"
         )
     target = spec.stop.training_return
     if env.threshold is not None and target is not None and target < env.threshold:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+from collections.abc import Collection, Iterator
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -36,7 +37,7 @@ def http_client(url: str, *, ca_hint: str = "", **options: Any) -> httpx2.Client
     except OSError as error:
         raise _unread_certificates(error, ca_hint) from error
     except (ImportError, ValueError, httpx2.InvalidURL):
-        wrong = wrong_proxy(url)
+        wrong = next(_wrong_proxies(("http", "https", "all")), None)
         if wrong is None:
             raise
         # Not from the error, whose text may have a part of the proxy's password in it.
@@ -53,48 +54,61 @@ def is_this_machine(url: str) -> bool:
 
 
 def wrong_proxy(url: str) -> TuneJobsError | None:
-    """Return the error for a proxy of the environment that can't be used; None: all can, or none is asked for.
-
-    Of its address nothing is shown but a scheme that isn't known: the rest may have a password in it.
+    """Return the error for the proxy by which an address is asked; None: there is none, or it can be used.
 
     Args:
         url: The address that is asked.
     """
+    from urllib.request import proxy_bypass_environment
+
+    parts = urlsplit(url)
+    if is_this_machine(url) or proxy_bypass_environment(parts.netloc.rpartition("@")[2]):
+        return None
+    return next(_wrong_proxies((parts.scheme, "all")), None)
+
+
+def _wrong_proxies(kinds: Collection[str]) -> Iterator[TuneJobsError]:
+    """Yield an error for each proxy of the environment that can't be used.
+
+    Of its address nothing is shown but a scheme that isn't known: the rest may have a password in it.
+
+    Args:
+        kinds: Of what they are: http, https, all.
+    """
     from urllib.request import getproxies_environment
 
-    for kind, text in () if is_this_machine(url) else getproxies_environment().items():
-        if kind not in ("http", "https", "all"):
+    for kind, text in getproxies_environment().items():
+        if kind not in kinds:
             continue
         name = f"{kind}_proxy" if f"{kind}_proxy" in os.environ else f"{kind.upper()}_PROXY"
         proxy = text if "://" in text else f"http://{text}"
         scheme = proxy.partition("://")[0].lower()
         hint = f"Have {name} name one as http://HOST:PORT, or unset it."
         if scheme.isalnum() and scheme not in _PROXY_SCHEMES:
-            return SpecError(
+            yield SpecError(
                 f"The proxy that {name} names has the scheme {scheme}; known are {', '.join(_PROXY_SCHEMES)}.", hint
             )
-        if not _has_host(proxy):
-            return SpecError(
+        elif not _has_host(proxy):
+            yield SpecError(
                 f"The proxy that {name} names has no address of a host and port (not shown: it may hold a password).",
                 hint,
             )
-        if scheme.startswith("socks") and find_spec("socksio") is None:
-            return CannotRunError(
+        elif scheme.startswith("socks") and find_spec("socksio") is None:
+            yield CannotRunError(
                 f"The proxy that {name} names speaks SOCKS, which needs socksio, and that is not installed.",
                 f"Install it with `pip install socksio`, or: {hint[0].lower()}{hint[1:]}",
             )
-    return None
 
 
 def _has_host(proxy: str) -> bool:
     import httpx2
 
     try:
-        # A name that the DNS can't hold, such as a..b, is found out where it is asked for.
-        httpx2.Proxy(proxy).url.host.encode("idna")
+        host = httpx2.Proxy(proxy).url.host
+        # A name that the DNS can't hold, such as a..b, raises.
+        return bool(host.encode("idna"))
     except (ValueError, httpx2.InvalidURL):
         return False
-    return True
 
 
 def _unread_certificates(error: OSError, ca_hint: str) -> SpecError:

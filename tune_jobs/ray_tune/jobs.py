@@ -91,6 +91,8 @@ def token_of(environment: Mapping[str, str]) -> str | None:
     if environment.get("RAY_AUTH_MODE", "").lower() != "token":
         return None
     token = environment.get("RAY_AUTH_TOKEN", "").strip()
+    if token and not (token.isascii() and token.isprintable()):
+        raise SpecError("RAY_AUTH_TOKEN is no token: it has characters that no token has.", "Set it to the cluster's.")
     if token:
         return token
     named = environment.get("RAY_AUTH_TOKEN_PATH")
@@ -116,7 +118,9 @@ class JobsApi:
         timeout_s: How long an answer may take.
 
     Raises:
-        SpecError: The address has another form, or there is no token though there is to be one.
+        SpecError: The address has another form, there is no token though there is to be one, or the environment names a
+            proxy or certificates that are none.
+        CannotRunError: What a proxy of the environment needs is not installed.
     """
 
     def __init__(self, address: str, *, timeout_s: float = _TIMEOUT_S) -> None:
@@ -224,6 +228,8 @@ class JobsApi:
         try:
             answer = self._http.request(method, f"{self.address}{path}", **more)
         except httpx2.ConnectError as error:
+            if wrong := wrong_proxy(self.address):
+                raise wrong from None
             raise CannotRunError(
                 f"Nothing answers at {self.address}: {said_by(error) or type(error).__name__}.", _NO_DASHBOARD
             ) from error
