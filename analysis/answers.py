@@ -17,6 +17,7 @@ _MEANS: dict[Objective, str] = {
     "best": "in its best evaluation",
     "steps_to_threshold": "env steps to the threshold",
 }
+_TOO_LARGE = "scores are too large to be squared, so it is not known how much seeds differ"
 _TOLD_SHARE = 0.1
 """Of half an interval: by so much less than its score has to be expected of a setting for that to be told."""
 
@@ -60,11 +61,10 @@ def less_expected(settings: SettingsRecord) -> str:
 
 def why_unsure(settings: SettingsRecord) -> str:
     """Return why nothing is known of how much seeds differ, where the leading setting has no interval."""
-    seeds = [item.scores for item in settings.ranking]
-    if max(map(len, seeds)) < 2:
+    if not settings.several_seeds:
         return "one seed a setting names a good policy, not a good setting"
-    if any(len(set(scores)) > 1 for scores in seeds):
-        return "scores are too large to be squared, so it is not known how much seeds differ"
+    if any(len(set(item.scores)) > 1 for item in settings.ranking):
+        return _TOO_LARGE
     return "no two seeds of a setting differ, so it is not known how much they may"
 
 
@@ -72,7 +72,9 @@ def certainty(settings: SettingsRecord) -> str:
     """Return how sure it is that the leading setting is the best."""
     best = settings.best
     if best.probability_best is None:
-        return f"{why_unsure(settings)}: see `tune-jobs replicate`"
+        why = why_unsure(settings)
+        # More seeds would be as large.
+        return why if why == _TOO_LARGE else f"{why}: see `tune-jobs replicate`"
     text = f"the best of {settings.num_settings:,} with a probability of {_percent(best.probability_best)}"
     others = settings.num_may_be_best - 1
     if others <= 0:

@@ -93,6 +93,12 @@ class FrontRecord(Record):
     may_be_best: bool | None = Field(
         None, description="Whether the data can't tell `cheapest_near` from the best; None: no two seeds differ."
     )
+    most_seeds: Count | None = Field(None, description="The most that any setting has; None: a former record.")
+
+    @property
+    def several_seeds(self) -> bool:
+        """Whether any setting, listed or not, has two seeds or more; of a former record, any that is listed."""
+        return (self.most_seeds or max(item.num_seeds for item in self.points)) > 1
 
 
 class SettingsRecord(Record):
@@ -104,11 +110,17 @@ class SettingsRecord(Record):
     num_may_be_best: Count = Field(description="How many of all the data can't tell from the best, itself included.")
     ranking: tuple[SettingRecord, ...] = Field(min_length=1, description="The leading ones, best first.")
     front: FrontRecord | None = Field(None, description="Score against cost; None: the sweep doesn't ask for it.")
+    most_seeds: Count | None = Field(None, description="The most that any setting has; None: a former record.")
 
     @property
     def best(self) -> SettingRecord:
         """The setting to train with."""
         return self.ranking[0]
+
+    @property
+    def several_seeds(self) -> bool:
+        """Whether any setting, listed or not, has two seeds or more; of a former record, any that is listed."""
+        return (self.most_seeds or max(len(item.scores) for item in self.ranking)) > 1
 
 
 class CandidateRecord(Record):

@@ -73,6 +73,7 @@ def front_of(ranking: Sequence[SettingScores], untrained: float | None) -> Front
         untrained=untrained,
         near_score=near_score,
         may_be_best=None if with_best is None else cheapest in with_best,
+        most_seeds=max(len(item.scores) for item in ranking),
     )
 
 

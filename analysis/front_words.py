@@ -89,8 +89,7 @@ def near_text(front: FrontRecord) -> str:
 def undecided_text(front: FrontRecord) -> str:
     """Say how sure it is who is on the front."""
     if front.num_undecided is None:
-        several = any(item.num_seeds > 1 for item in front.points)
-        why = "It is not known how much seeds differ" if several else "Each setting has one seed"
+        why = "It is not known how much seeds differ" if front.several_seeds else "Each setting has one seed"
         return f"{why}: nothing says how sure it is who is on the front."
     if not front.num_undecided:
         return "The data tell all other settings from those on the front."

@@ -69,6 +69,7 @@ def judge_settings(
             for index, item in enumerate(ranking[:NUM_LISTED])
         ),
         front=None if cost is None else front_of(ranking, untrained_return(results)),
+        most_seeds=max(len(item.scores) for item in ranking),
     )
 
 

@@ -36,8 +36,11 @@ class Comparison:
     notes: tuple[str, ...]
     """What has to be known to read the numbers."""
     failed_score: float | None = None
-    """What a failed seed counts as, the worst of all that are compared; None: the worst of its sweep, as nothing is on
-    one scale, or there are no scores."""
+    """What a failed seed counts as, the worst of all sweeps that are compared, with all of their settings; None: the
+    worst of its sweep, as nothing is on one scale, or there are no scores."""
+    longest_env_steps: int | None = None
+    """By `steps_to_threshold`, the env steps of a training of the longest sweep: one that never reaches the threshold
+    counts as twice these, in all sweeps; None: each has its own, or it is judged by something else."""
 
 
 def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Comparison:
@@ -57,15 +60,24 @@ def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Com
     notes += [why] if why else []
     named = dict(zip(string.ascii_uppercase, wanted, strict=False))
     reasons = why_not_comparable([item.sweep for item in wanted], list(named))
-    ready = {letter: judged_alike(item, chosen, threshold) for letter, item in named.items()}
-    failed = None if reasons else _failed_score(list(ready.values()))
-    ready = {letter: judged_alike(item, chosen, threshold, failed) for letter, item in named.items()}
-    entries = tuple(make_entry(item, letter, shares_threshold=shares_threshold) for letter, item in ready.items())
+    alone = {letter: judged_alike(item, chosen, threshold) for letter, item in named.items()}
+    failed = None if reasons else _failed_score(list(alone.values()))
+    # Were it twice the length of each sweep, the shorter one would be the better for not reaching the threshold.
+    by_longest = chosen == "steps_to_threshold" and not reasons
+    longest = max(item.data.num_env_steps for item in wanted) if by_longest else None
+    ready = {
+        letter: judged_alike(item, chosen, threshold, failed, num_env_steps=longest) for letter, item in named.items()
+    }
+    entries = tuple(
+        make_entry(item, letter, alone[letter].data, shares_threshold=shares_threshold)
+        for letter, item in ready.items()
+    )
     pairs = () if reasons else tuple(make_pair(one, other, ready) for one, other in _pairs(entries))
-    notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries)]
+    notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries, longest)]
     if any(entry.num_failed for entry in entries):
-        notes.append(_told_of_failures(chosen, are_comparable=not reasons))
-    return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes), failed)
+        one_sweep = len({(item.sweep.name, item.sweep.created_at) for item in wanted}) == 1
+        notes.append(_told_of_failures(chosen, of_its_sweep=one_sweep or bool(reasons)))
+    return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes), failed, longest)
 
 
 def _failed_score(wanted: Sequence[Wanted]) -> float | None:
@@ -80,10 +92,11 @@ def _failed_score(wanted: Sequence[Wanted]) -> float | None:
     return failed_score(scores, wanted[0].data.objective, num_env_steps=longest)
 
 
-def _told_of_failures(objective: Objective, *, are_comparable: bool) -> str:
+def _told_of_failures(objective: Objective, *, of_its_sweep: bool) -> str:
     if objective == "steps_to_threshold":
         return "A failed seed counts as a training that never reaches the threshold."
-    of_whom = "all that are compared" if are_comparable else "its sweep"
+    # Settings that aren't compared count as well.
+    of_whom = "its sweep" if of_its_sweep else "all sweeps that are compared"
     return f"A failed seed counts as the worst training of {of_whom}."
 
 
@@ -150,12 +163,16 @@ def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[st
     return notes
 
 
-def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
+def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry], longest: int | None) -> list[str]:
     notes = _same_trainings(wanted, entries)
     budgets = {entry.letter: item.data.num_env_steps for item, entry in zip(wanted, entries, strict=True)}
     if len(set(budgets.values())) > 1:
         told = ", ".join(f"{letter} {steps:,}" for letter, steps in budgets.items())
         notes.append(f"Trials may take different numbers of env steps: {told}.")
+        if longest is not None:
+            notes.append(
+                f"One that never reaches the threshold counts as {2 * longest:,} env steps, twice the longest."
+            )
     versions = [item.sweep.versions for item in wanted]
     other = sorted(
         {name for known in versions for name in known if any(each.get(name) != known[name] for each in versions)}

@@ -49,7 +49,7 @@ class Entry:
     point: dict[str, Any]
     trial_ids: tuple[str, ...]
     scores: tuple[float, ...]
-    """One a training seed, higher is better; a failed seed has the worst score of all that are compared."""
+    """One a training seed, higher is better; a failed seed has the worst score of all sweeps that are compared."""
     num_failed: int
     num_solved: int | None
     mean: float | None
@@ -83,7 +83,12 @@ class Entry:
 
 
 def judged_alike(
-    wanted: Wanted, objective: Objective, threshold: float | None, failed_score: float | None = None
+    wanted: Wanted,
+    objective: Objective,
+    threshold: float | None,
+    failed_score: float | None = None,
+    *,
+    num_env_steps: int | None = None,
 ) -> Wanted:
     """Return what is compared, judged by this objective and solved at this return.
 
@@ -92,22 +97,31 @@ def judged_alike(
         objective: What it is judged by.
         threshold: The return that solves the env.
         failed_score: What a failed seed counts as; None: what its sweep by itself says.
+        num_env_steps: By `steps_to_threshold`, of what length a training is that never reaches it; None: its own.
     """
-    data = replace(wanted.data, objective=objective, threshold=threshold, failed_score=failed_score)
+    data = replace(
+        wanted.data,
+        objective=objective,
+        threshold=threshold,
+        failed_score=failed_score,
+        num_env_steps=wanted.data.num_env_steps if num_env_steps is None else num_env_steps,
+    )
     return replace(wanted, data=data)
 
 
-def make_entry(wanted: Wanted, letter: str, *, shares_threshold: bool = True) -> Entry:
+def make_entry(wanted: Wanted, letter: str, alone: SweepData, *, shares_threshold: bool = True) -> Entry:
     """Return the scores and the cost of a sweep or a setting.
 
     Args:
         wanted: What it is of; its `data` says what it is judged by, and which return solves the env.
         letter: What it is called.
+        alone: Its `data` as its sweep would have it by itself, whatever failures count as in others, and how long
+            those are: that says which setting leads.
         shares_threshold: False: its `data` has no threshold because those that it is compared with have another one.
     """
     data, threshold = wanted.data, wanted.data.threshold
     ranking = ranked_settings(data)
-    chosen = _chosen(wanted, ranking)
+    chosen = _chosen(wanted, ranking, alone)
     mine = _trials_of(wanted)
     costs = core_seconds(data.trials, wanted.cores)
     known = [costs[trial.trial_id] for trial in mine if trial.trial_id in costs]
@@ -153,18 +167,18 @@ def _trials_of(wanted: Wanted) -> list[TrialRecord]:
     return [trial for trial in wanted.data.trials if wanted.point_index in (None, trial.point_index)]
 
 
-def _chosen(wanted: Wanted, ranking: Sequence[SettingScores]) -> SettingScores | None:
+def _chosen(wanted: Wanted, ranking: Sequence[SettingScores], alone: SweepData) -> SettingScores | None:
     index = wanted.point_index
     if index is None:
-        # The setting that the sweep names by itself, whatever the others' worst is.
-        has_failures = any(item.num_unscored for item in ranking)
-        own = ranked_settings(replace(wanted.data, failed_score=None)) if has_failures else ranking
+        # The setting that the sweep names by itself, whatever the others' worst is, and how long they are.
+        is_judged_anew = alone.num_env_steps != wanted.data.num_env_steps or any(item.num_unscored for item in ranking)
+        own = ranked_settings(alone) if is_judged_anew else ranking
         index = own[0].point_index if own else None
     return next((item for item in ranking if item.point_index == index), None)
 
 
 def why_no_scores(wanted: Wanted, *, shares_threshold: bool = True) -> str:
-    """Return why a sweep or a setting has no scores; the arguments are those of `make_entry`."""
+    """Return why a sweep or a setting has no scores; its arguments are as those of `make_entry`."""
     mine = _trials_of(wanted)
     if not wanted.data.has_settings:
         return "it is a population, whose trials change their values while they train: none has a setting"

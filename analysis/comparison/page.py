@@ -66,7 +66,13 @@ def write_page(path: Path, comparison: Comparison, wanted: Mapping[str, Wanted])
     from markupsafe import Markup
 
     ready = {
-        entry.letter: judged_alike(wanted[entry.letter], comparison.objective, entry.threshold, comparison.failed_score)
+        entry.letter: judged_alike(
+            wanted[entry.letter],
+            comparison.objective,
+            entry.threshold,
+            comparison.failed_score,
+            num_env_steps=comparison.longest_env_steps,
+        )
         for entry in comparison.entries
     }
     page = (

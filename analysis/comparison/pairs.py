@@ -112,6 +112,16 @@ def _probability(left: Entry, right: Entry, level: float) -> tuple[Estimate | No
     return probability_of_improvement([left.scores], [right.scores], level=level), ""
 
 
+def _without_errors(left: Entry, right: Entry) -> str:
+    """Return why nothing is known of how much seeds differ where several do not; empty if it is."""
+    alike = [entry.letter for entry in (left, right) if entry.standard_error == 0.0]
+    if not alike:
+        return ""
+    who = "of either" if len(alike) > 1 else f"of a setting in {alike[0]}'s sweep"
+    # A mean is not exact because no seed was seen to differ, as it isn't of one seed.
+    return f"no two seeds {who} differ, so nothing is known of how much they may"
+
+
 def mean_difference(
     left: Entry, right: Entry, level: float = 0.95, *, of_one_sweep: bool = False
 ) -> tuple[Estimate | None, str]:
@@ -146,17 +156,20 @@ def mean_difference(
                 else f"{entry.letter} has one seed a setting, so that nothing is known of how its seeds differ "
                 f"(`tune-jobs replicate {entry.sweep}` trains more)"
             )
-        errors.append((entry.standard_error**2, entry.df))
+        errors.append((entry.standard_error, entry.df))
         means.append(entry.mean)
+    if why := _without_errors(left, right):
+        return None, why
     gap = means[0] - means[1]
-    total = sum(square for square, _ in errors)
+    # In units of a power of two, by which nothing is rounded, as the squares of small errors are lost.
+    exponent = math.frexp(max(error for error, _ in errors))[1]
+    squares = [(math.ldexp(error, -exponent) ** 2, df) for error, df in errors]
+    total = sum(square for square, _ in squares)
     num_seeds = len(left.scores) + len(right.scores)
-    if total == 0.0:
-        return None, "no two seeds of either differ, so nothing is known of how much they may"
-    df = total**2 / sum(square**2 / df for square, df in errors)
+    df = total**2 / sum(square**2 / df for square, df in squares)
     if of_one_sweep and left.sweep_df is not None:
         df = min(df, left.sweep_df)
-    half = t_quantile((1.0 + level) / 2.0, max(1.0, df)) * math.sqrt(total)
+    half = t_quantile((1.0 + level) / 2.0, max(1.0, df)) * math.ldexp(math.sqrt(total), exponent)
     return Estimate(gap, gap - half, gap + half, num_seeds), ""
 
 

@@ -84,8 +84,7 @@ def _of_settings(source: Source, settings: SettingsRecord) -> list[str]:
         score = score_text(settings, settings.best.score)
         return [f"All {settings.num_settings:,} settings scored {score}: the data can't order them."]
     if settings.best.probability_best is None:
-        several = max(len(item.scores) for item in settings.ranking) > 1
-        return _unsure(source, settings) if several else _one_seed(source, settings)
+        return _unsure(source, settings) if settings.several_seeds else _one_seed(source, settings)
     return [*_use(source, settings), *_runner_up(source, settings)]
 
 

@@ -122,14 +122,15 @@ def _about(source: Source) -> list[str]:
 
 
 def _of_seeds(settings: SettingsRecord) -> list[str]:
-    if max(len(item.scores) for item in settings.ranking) < 2:
+    if settings.best.lower is not None:
+        # Settings that aren't listed may be those of which seeds are known to differ.
+        return [_SEVERAL_SEEDS, _LEADS_BY_THEM]
+    if not settings.several_seeds:
         return [_ONE_SEED]
-    if settings.best.lower is None:
-        # Where nothing but one score is known, each is as probably the best.
-        return [
-            f"{why_unsure(settings).capitalize()}: there are no intervals, and nothing says that the first is the best."
-        ]
-    return [_SEVERAL_SEEDS, _LEADS_BY_THEM]
+    # Where nothing but one score is known, each is as probably the best.
+    return [
+        f"{why_unsure(settings).capitalize()}: there are no intervals, and nothing says that the first is the best."
+    ]
 
 
 def _letters(source: Source, settings: SettingsRecord) -> dict[int, str]:

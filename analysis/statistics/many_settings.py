@@ -18,7 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.statistics.estimate import Estimate, Values, check_level, finite_arrays, mean_of, variance
+from analysis.statistics.estimate import (
+    Estimate,
+    Values,
+    check_level,
+    exponent_of,
+    finite_arrays,
+    mean_of,
+    variance,
+)
 from analysis.statistics.student_t import t_quantile
 
 _BLOCK_VALUES = 2_000_000
@@ -80,8 +88,11 @@ def moderated_means(settings: Sequence[Values]) -> ModeratedMeans:
     if sizes.max() < 2:
         raise ValueError("no setting has two seeds, so nothing is known of how seeds differ")
     means = np.array([mean_of(array) for array in arrays])
+    # In units of a power of two, by which nothing is rounded, as the squares of small scores are lost.
+    exponent = min(0, exponent_of(np.concatenate(arrays)))
+    units = [np.ldexp(array, -exponent) for array in arrays]
     with np.errstate(over="ignore"):
-        own = np.array([variance(array) if array.size > 1 else np.nan for array in arrays])
+        own = np.array([variance(array) if array.size > 1 else np.nan for array in units])
     prior_df, prior_variance = _prior(own[sizes > 1], sizes[sizes > 1] - 1.0)
     own_df = sizes - 1.0
     known = np.where(sizes > 1, own, 0.0)
@@ -91,16 +102,17 @@ def moderated_means(settings: Sequence[Values]) -> ModeratedMeans:
         moderated = (prior_df * prior_variance + own_df * known) / (prior_df + own_df)
     # No more degrees of freedom than all settings have together.
     dfs = np.minimum(prior_df + own_df, own_df.sum())
-    return ModeratedMeans(means, np.sqrt(moderated / sizes), dfs, sizes, own, math.isinf(prior_df))
+    errors = np.ldexp(np.sqrt(moderated / sizes), exponent)
+    return ModeratedMeans(means, errors, dfs, sizes, np.ldexp(own, 2 * exponent), math.isinf(prior_df))
 
 
 def seeds_differ(settings: Sequence[Values]) -> bool:
     """Whether in any setting two seeds differ; where not, nothing is known of how much they may.
 
     Raises:
-        ValueError: In the cases of `moderated_means`.
+        ValueError: There are no settings, or one has no score or one that is not finite.
     """
-    return bool(moderated_means(settings).standard_errors.max() > 0.0)
+    return any(array.min() != array.max() for array in finite_arrays(settings, "settings"))
 
 
 def tell_the_best(settings: Sequence[Values]) -> bool:
@@ -110,7 +122,7 @@ def tell_the_best(settings: Sequence[Values]) -> bool:
     differ, nobody knows whether settings differ or seeds would.
 
     Raises:
-        ValueError: In the cases of `moderated_means`.
+        ValueError: In the cases of `seeds_differ`.
     """
     return seeds_differ(settings) or len({float(score) for scores in settings for score in scores}) == 1
 

@@ -117,7 +117,7 @@ def test_a_failed_seed_counts_as_the_worst_of_all_that_are_compared() -> None:
     trials = [left.data.trials[0].model_copy(update={"status": "failed"}), *left.data.trials[1:]]
     found = compare([dataclasses.replace(left, data=dataclasses.replace(left.data, trials=trials)), wanted("b", RIGHT)])
     assert found.entries[0].scores == (1.0, 8.0)
-    assert "A failed seed counts as the worst training of all that are compared." in found.notes
+    assert "A failed seed counts as the worst training of all sweeps that are compared." in found.notes
     worse = wanted("b", [0.5, 7.0])
     ours = dataclasses.replace(left, data=dataclasses.replace(left.data, trials=trials))
     assert compare([ours, worse]).entries[0].scores == (0.5, 8.0)
@@ -197,7 +197,8 @@ def test_env_steps_to_the_threshold_are_a_median_in_which_who_never_reached_it_c
 
 
 def test_scores_of_steps_are_told_without_a_minus() -> None:
-    both = [wanted("a", [9.0, 1.0], threshold=5.0), wanted("b", [9.0, 9.0], threshold=5.0)]
+    # The other setting says how much seeds of the second sweep differ: without it there is no difference to tell.
+    both = [wanted("a", [9.0, 1.0], threshold=5.0), wanted("b", [9.0, 9.0], [9.0, 1.0], threshold=5.0)]
     found = compare(both, "steps_to_threshold")
     assert dict(fact_rows(found))["env steps to goal"] == ["50,500", "1,000"]
     assert "A - B, over training seeds (env steps): +49,500" in said(found)

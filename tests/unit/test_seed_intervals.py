@@ -17,8 +17,10 @@ from analysis.statistics import (
     mean_with_ci,
     moderated_means,
     seed_intervals,
+    seeds_differ,
     t_interval,
     t_quantile,
+    tie_groups,
 )
 
 SCORES = [100.0, 120.0, 90.0, 300.0, 150.0, 110.0, 95.0, 200.0, 130.0, 105.0]
@@ -137,6 +139,29 @@ def test_scores_that_never_differ_are_said() -> None:
     for estimate in seed_intervals([[5.0, 5.0], [7.0, 7.0, 7.0]]):
         assert estimate.lower == estimate.mean == estimate.upper
         assert estimate.note == "in no setting any two seeds differ: how much they may is not known"
+
+
+@pytest.mark.parametrize("exponent", [-3, -600, -1000])
+def test_small_scores_have_the_intervals_of_large_ones_to_the_bit(exponent: int) -> None:
+    settings = [[1.0, 3.0, 7.0], [9.0], [8.0, 8.0]]
+    small = [[math.ldexp(score, exponent) for score in scores] for scores in settings]
+    fit, scaled = moderated_means(settings), moderated_means(small)
+    np.testing.assert_array_equal(scaled.standard_errors, np.ldexp(fit.standard_errors, exponent))
+    np.testing.assert_array_equal(scaled.dfs, fit.dfs)
+    for estimate, other in zip(seed_intervals(settings), seed_intervals(small), strict=True):
+        assert (other.lower, other.upper) == (
+            math.ldexp(estimate.lower, exponent),
+            math.ldexp(estimate.upper, exponent),
+        )
+    ties, same = (tie_groups(scores, rng=np.random.default_rng(0)) for scores in (settings, small))
+    assert (same.groups, same.with_leader) == (ties.groups, ties.with_leader)
+
+
+def test_whether_seeds_differ_is_known_of_scores_of_any_size() -> None:
+    for unit in (5e-324, 1e-170, 1.0, 1e200, 1e307):
+        assert seeds_differ([[unit], [2 * unit, 5 * unit]])
+        assert not seeds_differ([[unit], [2 * unit, 2 * unit]])
+    assert not seeds_differ([[1.0], [2.0]])
 
 
 def test_bad_values_of_settings() -> None:

@@ -1,6 +1,7 @@
 """What is told of the leading setting: that its seeds chose it, and nothing of how sure where no two seeds differ."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -151,12 +152,71 @@ def test_the_front_is_not_sure_where_no_two_seeds_differ() -> None:
     assert undecided_text(front).startswith("It is not known how much seeds differ: nothing says how sure")
 
 
+def test_settings_that_are_not_listed_may_be_those_that_have_several_seeds() -> None:
+    listed = [[100.0 + index] for index in range(12)]
+    source = source_of(*listed, [60.0, 50.0], [55.0, 62.0])
+    assert {len(item.scores) for item in present(source.settings).ranking} == {1}
+    assert present(source.settings).best.lower is not None
+    assert "Intervals are over training seeds, and learn from all settings" in about(source)
+    assert "Each was trained with one seed" not in about(source)
+    # Their seeds may tell nothing, and then it isn't for want of seeds.
+    alike = source_of(*listed, [60.0, 60.0])
+    settings = present(alike.settings)
+    assert certainty(settings).startswith("no two seeds of a setting differ")
+    assert answer.section(alike).sentences[0].startswith("No two seeds of a setting differ")
+    assert "No two seeds of a setting differ" in about(alike)
+    # A former record knows of those that it lists.
+    former = settings.model_copy(update={"most_seeds": None})
+    assert certainty(former).startswith("one seed a setting")
+
+
+def test_settings_beside_the_front_may_be_those_that_have_several_seeds() -> None:
+    front = present(judged(wanted("a", [300.0], [200.0, 200.0], [200.0, 200.0]).data).front)
+    assert [item.num_seeds for item in front.points] == [1]
+    assert undecided_text(front).startswith("It is not known how much seeds differ: ")
+    former = front.model_copy(update={"most_seeds": None})
+    assert undecided_text(former).startswith("Each setting has one seed: ")
+
+
+def test_more_seeds_are_no_advice_where_scores_are_too_large() -> None:
+    told = certainty(present(source_of([1e300, -1e300], [3.0, 4.0]).settings))
+    assert told == "scores are too large to be squared, so it is not known how much seeds differ"
+
+
+def test_small_scores_are_not_too_large() -> None:
+    points = [[1e-170, 3e-170], [9e-170, 8e-170]]
+    settings = present(source_of(*points).settings)
+    assert 0.0 < present(settings.best.lower) < settings.best.score
+    assert certainty(settings).startswith("the best of 2 with a probability of ")
+    difference = present(the_pair(compare([wanted("a", points[0]), wanted("b", points[1])])).difference)
+    large = present(the_pair(compare([wanted("a", [1.0, 3.0]), wanted("b", [9.0, 8.0])])).difference)
+    assert difference.upper == pytest.approx(large.upper * 1e-170, rel=1e-9)
+
+
 def test_a_comparison_has_no_interval_where_no_two_seeds_of_a_sweep_differ() -> None:
     found = compare([wanted("a", *ALIKE), wanted("b", [250.0, 251.0], [100.0, 90.0])])
     assert (found.entries[0].lower, found.entries[0].upper) == (None, None)
     assert found.entries[1].lower is not None
     assert "300.0 to 300.0" not in said(found)
-    assert the_pair(found).difference is not None
+    # Nor is its mean taken for exact beside the other one's.
+    pair = the_pair(found)
+    assert pair.difference is None
+    assert pair.verdict == (
+        "Whether A or B is better can't be said: no two seeds of a setting in A's sweep differ, so nothing is known of "
+        "how much they may."
+    )
+    assert present(pair.probability).mean == 1.0
+    # One pair of them that differs is enough, be it of another setting.
+    one = compare([wanted("a", ALIKE[0], [200.0, 201.0]), wanted("b", [250.0, 251.0], [100.0, 90.0])])
+    assert the_pair(one).verdict == "A is better than B."
+
+
+def test_a_race_by_scores_of_any_size_is_one_by_their_ratios() -> None:
+    race = Race((0, 1, 2, 3), 3)
+    plain = {0: [5.0, 5.01], 1: [4.0, 4.01], 2: [3.0, 3.01], 3: [2.0, 2.01]}
+    for exponent in (0, -600, 700):
+        scores = {index: [math.ldexp(score, exponent) for score in seeds] for index, seeds in plain.items()}
+        assert race.next_points(scores, 1) == ()
 
 
 def test_a_race_goes_on_where_no_two_seeds_differ() -> None:
@@ -222,6 +282,72 @@ def test_a_failed_seed_of_a_comparison_by_env_steps_has_never_reached_the_thresh
     assert "A failed seed counts as a training that never reaches the threshold." in found.notes
 
 
+def of_length(sweep: Wanted, num_env_steps: int) -> Wanted:
+    """The sweep, with trainings of as many env steps."""
+    return dataclasses.replace(sweep, data=dataclasses.replace(sweep.data, num_env_steps=num_env_steps))
+
+
+def sweeps_of_two_lengths() -> list[Wanted]:
+    """Two sweeps, in each of which a training reached the threshold, and one did not; in the first one failed, too."""
+    short = failing(wanted("a", [9.0, 1.0, 9.0], threshold=5.0), 2)
+    return [of_length(short, 10_000), of_length(wanted("b", [9.0, 1.0, 9.0], threshold=5.0), 1_000_000)]
+
+
+def test_what_never_reaches_the_threshold_counts_the_same_in_sweeps_of_other_lengths() -> None:
+    found = compare(sweeps_of_two_lengths(), "steps_to_threshold")
+    assert (found.failed_score, found.longest_env_steps) == (-2_000_000.0, 1_000_000)
+    ours, theirs = found.entries
+    assert ours.scores == (-1_000.0, -2_000_000.0, -2_000_000.0)
+    assert theirs.scores == (-1_000.0, -2_000_000.0, -1_000.0)
+    assert (ours.num_env_steps, theirs.num_env_steps) == (3_000, 3_000)
+    assert "Trials may take different numbers of env steps: A 10,000, B 1,000,000." in found.notes
+    assert "One that never reaches the threshold counts as 2,000,000 env steps, twice the longest." in found.notes
+    # One that reached it wins over one that did not; all others are alike.
+    shared = present(the_pair(found).shared)
+    assert shared.probability.mean == pytest.approx((1 + 4 * 0.5) / 9)
+
+
+def test_by_other_objectives_a_training_has_the_length_of_its_sweep() -> None:
+    sweeps = sweeps_of_two_lengths()
+    short = sweeps[0]
+    first = short.data.results["t0000"]
+    rising = [*first, first[0].model_copy(update={"iteration": 2, "num_env_steps": 10_000, "evaluation_return": 20.0})]
+    data = dataclasses.replace(short.data, results={**short.data.results, "t0000": rising})
+    sweeps[0] = dataclasses.replace(short, data=data)
+    found = compare(sweeps, "area")
+    # Half of the way from 9 to 20 on average, which by the other sweep's length would be 20 nearly.
+    assert found.entries[0].scores[0] == pytest.approx(0.1 * 9.0 + 0.9 * 14.5, rel=0.05)
+    assert found.longest_env_steps is None
+    assert not any("never reaches" in note for note in found.notes)
+
+
+def test_which_setting_leads_a_sweep_does_not_go_by_the_length_of_another() -> None:
+    # Of its own 10,000 env steps its first setting reaches the threshold sooner, in two of three; by the other sweep's
+    # million the third would outweigh that.
+    ours = of_length(wanted("a", [9.0, 9.0, 1.0], [9.0, 9.0, 9.0], threshold=5.0), 10_000)
+    late = [item.model_copy(update={"num_env_steps": 9_900}) for item in ours.data.results["t0003"]]
+    results = {**ours.data.results, **dict.fromkeys(("t0003", "t0004", "t0005"), late)}
+    ours = dataclasses.replace(ours, data=dataclasses.replace(ours.data, results=results))
+    theirs = of_length(wanted("b", [9.0, 9.0, 9.0], threshold=5.0), 1_000_000)
+    found = compare([ours, theirs], "steps_to_threshold")
+    assert found.entries[0].point_index == 0
+    assert found.entries[0].scores == (-1_000.0, -1_000.0, -2_000_000.0)
+
+
+def test_a_failed_setting_of_one_sweep_counts_as_the_worst_of_that_sweep() -> None:
+    """Settings that aren't among those compared count, too."""
+    sweep = failing(wanted("a", [500.0, 490.0, 0.0], [480.0, 470.0, 475.0], [10.0, 11.0, 12.0]), 2)
+    settings = [dataclasses.replace(sweep, name=f"a/p{index}", point_index=index) for index in (0, 1)]
+    found = compare(settings)
+    assert found.entries[0].scores == (500.0, 490.0, 10.0)
+    assert "A failed seed counts as the worst training of its sweep." in found.notes
+    # Of one name are two sweeps, too.
+    another = dataclasses.replace(settings[1], sweep=sweep.sweep.model_copy(update={"created_at": 1.0}))
+    assert "A failed seed counts as the worst training of all sweeps that are compared." in (
+        compare([settings[0], another]).notes
+    )
+
+
 def test_the_page_of_a_comparison_has_the_same_score_for_a_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,6 +361,11 @@ def test_the_page_of_a_comparison_has_the_same_score_for_a_failure(
     sweeps = [failing(wanted("a", [9.0, 8.0]), 1), wanted("b", [2.0, 3.0])]
     page.write_page(tmp_path / "page.html", compare(sweeps), dict(zip("AB", sweeps, strict=True)))
     assert drawn == [9.0, 2.0]
+    drawn.clear()
+    sweeps = sweeps_of_two_lengths()
+    found = compare(sweeps, "steps_to_threshold")
+    page.write_page(tmp_path / "page.html", found, dict(zip("AB", sweeps, strict=True)))
+    assert drawn == list(found.entries[0].scores)
 
 
 def test_the_report_and_the_table_say_what_a_failed_seed_counts_as() -> None:

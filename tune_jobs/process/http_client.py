@@ -59,10 +59,10 @@ def wrong_proxy(url: str) -> TuneJobsError | None:
     Args:
         url: The address that is asked.
     """
-    from urllib.request import proxy_bypass_environment
+    from urllib.request import proxy_bypass
 
     parts = urlsplit(url)
-    if is_this_machine(url) or proxy_bypass_environment(parts.netloc.rpartition("@")[2]):
+    if is_this_machine(url) or proxy_bypass(parts.netloc.rpartition("@")[2]):
         return None
     return next(_wrong_proxies((parts.scheme, "all")), None)
 
