@@ -90,6 +90,31 @@ def test_a_checkpoint_whose_files_are_missing_while_it_is_replaced_is_uploaded_a
     opened().trial("t0000").verify_checkpoint(1)
 
 
+def test_copies_that_are_to_go_while_an_older_checkpoint_is_uploaded_go_with_the_newer_one(
+    faults: Faults, opened: Opened
+) -> None:
+    trial, other = opened().trial("t0000"), opened().trial("t0001")
+    trial.take()
+    other.write_checkpoint(make_checkpoint(20, trial_id="t0001"), fill)
+    opened().trial("t0000").copy_checkpoint(other.checkpoint_folder(20), 5)
+    seen = list[bool]()
+
+    def go_on() -> None:
+        trial.write_checkpoint(make_checkpoint(6), fill)
+        trial.remove_copies()
+
+    def look() -> None:
+        seen.append(opened().trial("t0000").copied_checkpoint(5).exists())
+
+    faults.rule("slow", kinds="PUT", keys="/t0000/head.json$", then=go_on)
+    faults.rule("slow", kinds="PUT", keys="/t0000/head.json$", then=look)
+    trial.write_checkpoint(make_checkpoint(4), fill)
+    trial.remove_copies()
+    trial.settle()
+    look()
+    assert seen == [True, False]
+
+
 def test_readers_that_look_at_once_see_each_result_once(
     faults: Faults, opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,6 +10,7 @@ from stores import Harness
 
 from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.store.contract import Sweep, Trial
+from tune_jobs.store.manifests import verify_checkpoint
 
 # -- checkpoints
 
@@ -29,6 +30,18 @@ def test_a_checkpoint_comes_back_as_it_was_written(sweep: Sweep, trial: Trial, a
     again = another()  # what it has fetched is there as long as it is
     for folder in (found.checkpoint_folder(20), again.checkpoint_folder(make_checkpoint(20))):
         assert (folder / "state" / "weights").read_text() == "abc"
+
+
+def test_a_checkpoint_is_read_in_a_block_by_its_writer_and_by_others(trial: Trial, another: Reopen) -> None:
+    trial.write_checkpoint(make_checkpoint(3), fill)
+    for is_writer in (True, False):
+        # The writer's may not be in the store yet; another one comes when it is.
+        found = trial if is_writer else another().trial("t0000")
+        with found.reading_checkpoint(3) as folder:
+            assert verify_checkpoint(folder) == make_checkpoint(3)
+            assert (folder / "state" / "weights").read_text() == "abc"
+        with found.reading_checkpoint(4) as folder:
+            assert not folder.exists()
 
 
 def test_a_checkpoint_is_seen_when_it_is_whole(trial: Trial, another: Reopen) -> None:

@@ -95,6 +95,28 @@ def test_who_lost_a_trial_writes_nothing_of_it(harness: Harness, trial: Trial, a
     assert {key: harness.content("mine", key) for key in harness.keys("mine")} == before
 
 
+@pytest.mark.parametrize("saves", [False, True])
+def test_who_lost_a_trial_and_does_not_know_it_removes_no_copy(trial: Trial, another: Reopen, saves: bool) -> None:
+    other, reader, kept = another().trial("t0001"), another().trial("t0000"), list[bool]()
+    trial.take()
+    another().trial("t0000").take()
+    other.write_checkpoint(make_checkpoint(4, trial_id="t0001"), fill)
+    another().trial("t0000").copy_checkpoint(other.checkpoint_folder(4), 7)
+
+    def remove_and_wait() -> None:
+        if saves:
+            trial.write_checkpoint(make_checkpoint(9), fill)
+        trial.remove_copies()
+        kept.append(reader.copied_checkpoint(7).exists())
+        # Here at the latest.
+        trial.settle()
+
+    with pytest.raises(OwnershipLostError):
+        remove_and_wait()
+    assert all(kept)
+    assert another().trial("t0000").copied_checkpoint(7).exists()
+
+
 def test_a_trial_that_is_lost_while_its_checkpoint_is_written_gets_none(trial: Trial, another: Reopen) -> None:
     trial.take()
 

@@ -37,7 +37,8 @@ def copy_latest_checkpoint(source: Trial, target: Trial, iteration: int) -> Chec
             known = source.checkpoints()
             if not known:
                 break
-            return target.copy_checkpoint(source.checkpoint_folder(known[-1].iteration), iteration)
+            with source.reading_checkpoint(known[-1].iteration) as folder:
+                return target.copy_checkpoint(folder, iteration)
         except (OSError, NotFoundError) as error:
             # It was deleted while it was copied, so there is a newer one.
             reason = error

@@ -209,6 +209,16 @@ class Trial(Protocol):
         """
         ...
 
+    def reading_checkpoint(self, iteration: int) -> AbstractContextManager[Path]:
+        """Yield a local folder as `checkpoint_folder` returns it, which is there in the block.
+
+        What a store far away fetched for it is removed after it: for who reads many checkpoints one after the other.
+
+        Raises:
+            CheckpointError: A symbolic link is in the way.
+        """
+        ...
+
     def verify_checkpoint(self, iteration: int) -> CheckpointRecord:
         """Check every file against the manifest, before any file is read.
 
@@ -270,6 +280,9 @@ class Trial(Protocol):
 
     def remove_copies(self, keep: Collection[int] = ()) -> None:
         """Delete all copies except those of some iterations.
+
+        Where checkpoints are kept a moment later, a process that has taken the trial deletes its copies after them, and
+        only those made before the latest one: until then the trial goes on from a copy.
 
         Raises:
             OwnershipLostError: This process had taken the trial, and another one has it now.

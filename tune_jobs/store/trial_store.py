@@ -12,7 +12,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
@@ -169,6 +169,11 @@ class TrialStore(OwnedFolder):
                 "Delete this folder; the trial continues from its other checkpoints.",
             )
         return record
+
+    @contextlib.contextmanager
+    def reading_checkpoint(self, iteration: int) -> Iterator[Path]:
+        """Yield the checkpoint's folder."""
+        yield self.checkpoint_folder(iteration)
 
     def verify_checkpoint(self, iteration: int) -> CheckpointRecord:
         """Check every file of a checkpoint; see `Trial.verify_checkpoint`."""

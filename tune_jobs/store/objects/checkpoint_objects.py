@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -72,10 +73,11 @@ class CheckpointObjects:
         is_same = (folder / names.MANIFEST).read_text(encoding="utf-8") == manifest
         return StoredCheckpoint(key=key, manifest=manifest) if is_same else None
 
-    def keys_of(self, iteration: int, stored: StoredCheckpoint) -> list[str]:
-        """Return the objects of a checkpoint; none if its manifest cannot be read, which leaves leftovers."""
-        try:
-            described = json.loads(stored.manifest)["files"]
-        except MALFORMED:
-            return []
-        return [f"{self.prefix_of(iteration, stored.key)}/{name}" for name in described]
+    def keys_of(self, checkpoints: Mapping[int, StoredCheckpoint], named: Collection[str]) -> list[str]:
+        """Return the objects of checkpoints that are not named; one whose manifest cannot be read leaves leftovers."""
+        found = []
+        for iteration, stored in checkpoints.items():
+            with contextlib.suppress(*MALFORMED):
+                described = json.loads(stored.manifest)["files"] if stored.key not in named else ()
+                found += [f"{self.prefix_of(iteration, stored.key)}/{name}" for name in described]
+        return found

@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import os
-import secrets
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -19,7 +18,7 @@ from policies.errors import MALFORMED, CannotRunError, CheckpointError, NotFound
 from policies.files import open_to_append
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
-from tune_jobs.store.manifests import described_files, files_of, read_manifest, verify_checkpoint
+from tune_jobs.store.manifests import files_of, read_manifest, verify_checkpoint
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import Listed
 from tune_jobs.store.objects.logs import LogUploads
@@ -27,7 +26,7 @@ from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.scratch import filling, make_local
 from tune_jobs.store.objects.trial_state import TrialState
-from tune_jobs.store.places import check_trial_id, within
+from tune_jobs.store.places import check_trial_id
 from tune_jobs.store.results_file import ResultsFile, Scored
 from tune_jobs.store.results_tail import NewPoints, ResultsMark
 from tune_jobs.store.trial_contract import Ownership
@@ -199,6 +198,20 @@ class ObjectTrial:
         """Return a local folder with a checkpoint's files."""
         return self._state.checkpoint_folder(iteration)
 
+    @contextlib.contextmanager
+    def reading_checkpoint(self, iteration: int) -> Iterator[Path]:
+        """Yield a local folder with a checkpoint's files, which are removed after the block if it fetched them."""
+        if self._state.is_writing:
+            yield self.checkpoint_folder(iteration)
+            return
+        # Fetched for a reader of its own: what `checkpoint_folder` has returned stays.
+        reader = TrialState(self._parts, self.trial_id)
+        try:
+            yield reader.checkpoint_folder(iteration)
+        finally:
+            # Its folder, with the two that trials lie in.
+            shutil.rmtree(reader.folder().parents[1], ignore_errors=True)
+
     def verify_checkpoint(self, iteration: int) -> CheckpointRecord:
         """Check every file against the manifest."""
         with self._parts.named():
@@ -226,46 +239,20 @@ class ObjectTrial:
 
     def copy_checkpoint(self, folder: Path, iteration: int) -> CheckpointRecord:
         """Copy a whole checkpoint; it is in the store when this returns."""
-        record = verify_checkpoint(folder)
-        prefix = self._copy_prefix(iteration)
-        bucket = self._parts.bucket
-        # Without its manifest, what is there of an earlier copy is none.
-        bucket.delete([f"{prefix}/{names.MANIFEST}"])
-        files = files_of(folder)
-        manifest = files.pop(names.MANIFEST)
-        for name, path in files.items():
-            bucket.put(f"{prefix}/{name}", path)
-        bucket.put(f"{prefix}/{names.MANIFEST}", manifest)
-        return record
+        return self._state.copies.copy(folder, iteration)
 
     def copied_checkpoint(self, iteration: int) -> Path:
         """Return a local folder with a copy; it does not exist if there is no copy."""
-        folder = within(self._state.folder(), names.COPIES_FOLDER, f"{iteration:06d}")
-        prefix = self._copy_prefix(iteration)
-        # Elsewhere first: a copy of which some files could not be fetched is none.
-        made = self._state.folder() / "fetched" / secrets.token_hex(8)
-        if not folder.exists() and self._parts.bucket.fetch(f"{prefix}/{names.MANIFEST}", made / names.MANIFEST):
-            for name in described_files(made):
-                self._parts.bucket.fetch(f"{prefix}/{name}", made / name)
-            with filling():
-                folder.parent.mkdir(parents=True, exist_ok=True)
-                made.rename(folder)
-        return folder
+        return self._state.copies.fetch(iteration)
 
     def remove_copies(self, keep: Collection[int] = ()) -> None:
-        """Delete all copies except those of some iterations."""
+        """Delete copies; who has taken the trial does so once the store has the checkpoint that replaces them."""
         self._state.check()
-        kept = tuple(f"{self._copy_prefix(iteration)}/" for iteration in keep)
-        prefix = f"{self._folder}/{names.COPIES_FOLDER}/"
-        gone = [item.key for item in self._parts.bucket.listed(prefix) if not item.key.startswith(kept)]
-        # The manifest first: half a copy is none.
-        self._parts.bucket.delete(sorted(gone, key=lambda key: not key.endswith(f"/{names.MANIFEST}")))
-        for folder in (self._state.folder() / names.COPIES_FOLDER).glob("*"):
-            if int(folder.name) not in keep:
-                shutil.rmtree(folder, ignore_errors=True)
-
-    def _copy_prefix(self, iteration: int) -> str:
-        return f"{self._folder}/{names.COPIES_FOLDER}/{iteration:06d}"
+        if self._state.is_taken:
+            self._state.copies.note(keep)
+            self._state.changed()
+        else:
+            self._state.copies.remove(keep)
 
     # -- what was damaged
 
@@ -286,20 +273,17 @@ class ObjectTrial:
         self._state.begin()
         number = int(path.name)
         if prefix:
-            name = f"{prefix}{path.name}"
+            name, copies = f"{prefix}{path.name}", self._state.copies
             target = f"{self._folder}/{names.DAMAGED_FOLDER}/{name}"
-            source = f"{self._copy_prefix(number)}/"
+            source = f"{copies.prefix_of(number)}/"
             for item in self._parts.bucket.listed(source):
                 found = self._parts.bucket.get(item.key)
                 if found is not None:
                     self._parts.bucket.put(f"{target}/{item.key.removeprefix(source)}", found.data)
-            self.remove_copies([copy for copy in self._copies() if copy != number])
+            # At once: a damaged copy is replaced by no checkpoint.
+            copies.remove([copy for copy in copies.iterations() if copy != number])
             return f"{names.DAMAGED_FOLDER}/{name}"
         return f"{names.DAMAGED_FOLDER}/{self._state.set_aside(number)}"
-
-    def _copies(self) -> list[int]:
-        found, _ = self._parts.bucket.children(f"{self._folder}/{names.COPIES_FOLDER}")
-        return [int(name) for name in found if name.isdecimal()]
 
     def latest_damaged(self) -> int:
         """Return the latest iteration of a checkpoint that was set aside; 0 if there is none."""

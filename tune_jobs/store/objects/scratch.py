@@ -103,6 +103,20 @@ def write_local(path: Path, data: bytes | str) -> None:
         write_atomic(path, data)
 
 
+def grow_local(path: Path, data: bytes) -> None:
+    """Write a file into one of these folders; one that begins like it stays the same file, for who has it open.
+
+    Raises:
+        CannotRunError: It cannot be written.
+    """
+    present = path.read_bytes() if path.exists() else None
+    if present is None or not data.startswith(present):
+        write_local(path, data)
+        return
+    with filling(), path.open("ab") as file:
+        file.write(data[len(present) :])
+
+
 def _cannot_fill(error: OSError) -> CannotRunError:
     return CannotRunError(f"Files of this machine cannot be written to {_place()}: {_reason(error)}.", _HINT)
 

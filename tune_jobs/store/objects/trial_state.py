@@ -19,13 +19,14 @@ from tune_jobs.store import names
 from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.objects.bucket import ConflictError, StorageError, Tag
 from tune_jobs.store.objects.checkpoint_objects import CheckpointObjects
+from tune_jobs.store.objects.copy_objects import CopyObjects
 from tune_jobs.store.objects.head import NAMED, Chunk, Head, StoredCheckpoint, free, read_head, unnamed
 from tune_jobs.store.objects.held import Held, held
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
 from tune_jobs.store.objects.parts import Parts
 from tune_jobs.store.objects.result_chunks import ResultChunks
-from tune_jobs.store.objects.scratch import filling, make_local, write_local
+from tune_jobs.store.objects.scratch import grow_local, make_local, write_local
 from tune_jobs.store.trial_contract import Ownership
 from tune_jobs.store.trial_store import TrialStore
 
@@ -56,7 +57,8 @@ class TrialState:
         self._tag: Tag | None = None
         self._token: str | None = None
         self._is_lost, self._looked_at = False, -float("inf")
-        self._is_writing = False
+        self.is_writing = False
+        """Whether the local files are the newest state."""
         self._is_first = False  # Whether this process is the first one that has ever taken the trial.
         # What this process has written, as names of local folders by iteration, and what is to be in the next head.
         self._checkpoints: dict[int, StoredCheckpoint | None] = {}
@@ -65,6 +67,7 @@ class TrialState:
         self._results: tuple[Chunk, ...] = ()
         self._has_results = False
         self._stored = CheckpointObjects(self._bucket, self._prefix)
+        self.copies = CopyObjects(self._bucket, self._prefix, self.folder)
         self._lock = threading.RLock()
         # What the head and the local results are as of, while much is read.
         self._head_of: object | None = None
@@ -80,7 +83,9 @@ class TrialState:
         outbox().forget([self._job])
         for _ in range(_ATTEMPTS):
             # An owner of before, who is refused here, is one that was replaced before this call.
-            asked: list[Callable[[], tuple[Head, Tag | None] | None]] = [self._read_head]
+            asked: list[Callable[[], tuple[Head, Tag | None] | None]] = [
+                lambda: read_head(self._bucket, self._head_key)
+            ]
             if under is not None:
                 asked.append(under.check)
             head, tag = side_by_side(lambda ask: ask(), asked)[0] or (Head(), None)
@@ -98,19 +103,16 @@ class TrialState:
             return
         raise CannotRunError(f"{self._name} is taken by one after the other.", "End those that drive this sweep.")
 
-    def _read_head(self) -> tuple[Head, Tag | None]:
-        return read_head(self._bucket, self._head_key)
-
     def _begin_writing(self, head: Head, tag: Tag | None) -> None:
         # Until all is here, what is here is not the newest state, and must not be written as if it were.
-        self._head, self._tag, self._is_writing = head, tag, False
+        self._head, self._tag, self.is_writing = head, tag, False
         self._checkpoints = dict(head.checkpoints)
         self._damaged, self._results, self._has_results = dict(head.damaged), head.results, head.has_results
         self._keys.clear()
         shutil.rmtree(self.folder(), ignore_errors=True)
         if not self._write_results(head):
             raise self._lacks_results()
-        self._is_writing = True
+        self.is_writing = True
 
     def check(self) -> None:
         """Raise an error if another process has become the owner, as far as is known."""
@@ -124,9 +126,14 @@ class TrialState:
             OwnershipLostError: Another process has become the owner, as far as is known.
         """
         self.check()
-        if not self._is_writing:
+        if not self.is_writing:
             with self._lock:
                 self._begin_writing(*read_head(self._bucket, self._head_key))
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether this process has taken the trial."""
+        return self._token is not None
 
     def is_lost(self) -> bool:
         """Whether this process has taken the trial, and another one has taken it since."""
@@ -159,22 +166,22 @@ class TrialState:
 
     def local(self) -> TrialStore:
         """Return the local files of the trial, with the results that there are now."""
-        if not self._is_writing:
+        if not self.is_writing:
             self._look()
         make_local(self.folder())
         return TrialStore(self.folder().parent.parent, self._trial_id)
 
     def has_results(self) -> bool:
         """Whether any results have been written."""
-        return self._has_results if self._is_writing else self._look_head().has_results
+        return self._has_results if self.is_writing else self._look_head().has_results
 
     def checkpoints(self) -> Mapping[int, StoredCheckpoint | None]:
         """Return the checkpoints by iteration; None stands for one that is not in the store yet."""
-        return dict(self._checkpoints) if self._is_writing else self._look_head().checkpoints
+        return dict(self._checkpoints) if self.is_writing else self._look_head().checkpoints
 
     def latest_damaged(self) -> int:
         """Return the latest iteration of a checkpoint that was set aside; 0 if there is none."""
-        damaged = self._damaged if self._is_writing else self._look_head().damaged
+        damaged = self._damaged if self.is_writing else self._look_head().damaged
         return max((int(name.partition("-")[0]) for name in damaged if name[:6].isdecimal()), default=0)
 
     def manifest_folder(self, iteration: int) -> Path:
@@ -238,13 +245,7 @@ class TrialState:
         content = self._chunks.read(head.results)
         if content is None:
             return False
-        present = path.read_bytes() if path.exists() else None
-        if present is not None and content.startswith(present):
-            # The same file grows, so that who has read its beginning reads on.
-            with filling(), path.open("ab") as file:
-                file.write(content[len(present) :])
-        else:
-            write_local(path, content)
+        grow_local(path, content)
         return True
 
     # -- what is written
@@ -307,7 +308,7 @@ class TrialState:
             wanted = dict(self._checkpoints)
             keys, damaged, has_results = dict(self._keys), dict(self._damaged), self._has_results
             content = (self.folder() / names.RESULTS).read_bytes() if has_results else b""
-            known = self._results
+            known, noted = self._results, self.copies.noted
         stored, results = self._upload_objects(wanted, keys, content, known)
         head = self._head.model_copy(
             update={
@@ -327,6 +328,7 @@ class TrialState:
                 if iteration in self._checkpoints and self._keys.get(iteration, checkpoint.key) == checkpoint.key:
                     self._checkpoints[iteration] = checkpoint
         self._remove_unnamed(before, head)
+        self.copies.remove_replaced(noted, max(stored, default=0))
 
     def _upload_objects(
         self,
@@ -381,9 +383,7 @@ class TrialState:
         """Remove the objects that one head named, and no head names any more."""
         named = now.named()
         gone = self._chunks.forget({chunk.key for chunk in before.results} - named)
-        for iteration, checkpoint in before.checkpoints.items():
-            if checkpoint.key not in named:
-                gone += self._stored.keys_of(iteration, checkpoint)
+        gone += self._stored.keys_of(before.checkpoints, named)
         # Nobody waits for it: what is not removed is a leftover.
         self._parts.remove_later(gone)
 
@@ -395,5 +395,5 @@ class TrialState:
 
     def leftovers(self, present: Sequence[str]) -> list[str]:
         """Return those of the trial's objects, which were listed before this call, that no head names."""
-        head = self._head if self._is_writing else self._look_head()
+        head = self._head if self.is_writing else self._look_head()
         return unnamed(self._prefix, present, head.named() | set(self._keys.values()))
