@@ -29,7 +29,7 @@ from policies.envs.masks import MaskedBox
 from policies.envs.own_actions import Choices, Numbers
 from policies.envs.own_process import OWN_PROCESS
 from policies.envs.together import stepper_of
-from policies.errors import EnvError, SpecError
+from policies.errors import EnvError, EnvFailedError, SpecError
 
 EndedBy = Literal["terminated", "truncated", "cap"]
 """How an episode ended: in a state that ends it, by a limit of the env, or at the cap on its steps."""
@@ -91,6 +91,9 @@ class Resettable(Protocol):
 class Evaluator:
     """Evaluates policies on fixed seeds, keeping its environments open between calls.
 
+    After an error of one of them all are made anew: a simulator that has ended, say, fails in each further call, and
+    the next policy may have nothing to do with it.
+
     Args:
         env_id: Gymnasium id.
         env_args: Arguments of the env's constructor; None: none.
@@ -117,6 +120,7 @@ class Evaluator:
         self.env_id, self.env_args = env_id, dict(env_args or {})
         self._max_envs = min(max_envs, _MAX_PROCESSES) if self.env_args.get(OWN_PROCESS) else max_envs
         self._envs = [make_env(env_id, self.env_args)]
+        self._are_spent = False
         self.max_episode_steps = episode_cap(self._envs[0], max_episode_steps)
         self._cartpoles = CartPolePlayer.make_if_cartpole(self._envs[0], env_id, self.env_args, self.seeds)
         self._classic = (
@@ -141,8 +145,12 @@ class Evaluator:
 
         Raises:
             NonFiniteWeightsError: A weight is NaN or infinite.
-            EnvError: The policy is for other observations or actions.
+            EnvError: The policy is for other observations or actions, or the environment cannot be made anew.
         """
+        if self._are_spent:
+            self._close_envs()
+            self._envs.append(make_env(self.env_id, self.env_args))
+            self._are_spent = False
         check_policy(policy, self._envs[0])
 
     def run(self, policy: Policy) -> Episodes:
@@ -150,30 +158,41 @@ class Evaluator:
 
         Raises:
             NonFiniteWeightsError: The policy's weights are NaN or infinite.
-            EnvError: The policy is for other observations or actions, or the env raised an error.
+            EnvError: The policy is for other observations or actions, the env raised an error, or it cannot be made
+                anew after one.
         """
         self.check(policy)
-        if isinstance(policy, Resettable):
-            # It draws random numbers in the order of its calls, so its episodes must be played one after the other.
-            results = [self._play_alone(policy, seed) for seed in self.seeds]
-        elif self._cartpoles is not None:
-            results = self._cartpoles.play(policy, self.max_episode_steps)
-        elif self._classic is not None and type(policy) is NetworkPolicy:
-            # Another may give actions of other types or outside of their bounds, which is the environment's to judge.
-            results = self._classic.play(policy, self.max_episode_steps)
-        else:
-            results = self._play_side_by_side(policy)
+        try:
+            results = self._play(policy)
+        except EnvFailedError:
+            # Made anew for the next policy, if one comes.
+            self._are_spent = True
+            raise
         returns, lengths = zip(*results, strict=True)
         return Episodes(self.seeds, returns, lengths)
 
+    def _play(self, policy: Policy) -> list[tuple[float, int]]:
+        if isinstance(policy, Resettable):
+            # It draws random numbers in the order of its calls, so its episodes must be played one after the other.
+            return [self._play_alone(policy, seed) for seed in self.seeds]
+        if self._cartpoles is not None:
+            return self._cartpoles.play(policy, self.max_episode_steps)
+        if self._classic is not None and type(policy) is NetworkPolicy:
+            # Another may give actions of other types or outside of their bounds, which is the environment's to judge.
+            return self._classic.play(policy, self.max_episode_steps)
+        return self._play_side_by_side(policy)
+
     def close(self) -> None:
         """Close the environments; `run` cannot be called afterwards."""
-        for env in self._envs:
-            close_env(env)
+        self._close_envs()
         if self._classic is not None:
             self._classic.close()
         if self._stepper is not None:
             self._stepper.close()
+
+    def _close_envs(self) -> None:
+        while self._envs:
+            close_env(self._envs.pop())
 
     def __enter__(self) -> Self:
         return self

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from meeting_packs import Packs, random_scores
 
+from tune_jobs.ray_tune import pack_state
 from tune_jobs.ray_tune.hyperband import HyperBand
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, Decision, NobodyWaits, Standing
 
@@ -99,6 +100,22 @@ def test_a_member_that_fails_does_not_hold_up_its_bracket(tmp_path: Path) -> Non
     packs = Packs(tmp_path, 6, random_scores(1), BAND, script=script, max_retries=0).run()
     assert packs.keeper.record("t0000").status == "failed"
     assert {record.status for record in packs.records()} == {"failed", "completed", "stopped"}
+
+
+@pytest.mark.parametrize("slots", [2, 64])
+def test_trials_whose_node_is_not_replaced_do_not_hold_up_their_bracket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slots: int
+) -> None:
+    monkeypatch.setattr(pack_state, "_PATIENCE_S", 0.0)
+    packs = Packs(tmp_path / "lost", 4, random_scores(1, 100), BAND, slots=slots)
+    for pack_id in ("p00", "p01"):
+        packs.step(pack_id)
+    packs.driver.moved("p01", "Node 10.0.0.7 was lost.")
+    del packs.processes["p01"]
+    packs.run()
+    whole = Packs(tmp_path / "whole", 4, random_scores(1, 100), BAND, slots=slots).run()
+    assert {record.status for record in packs.records()} == {"completed", "stopped"}
+    assert packs.curves() == whole.curves()
 
 
 @pytest.mark.parametrize("is_up", [False, True])

@@ -13,6 +13,7 @@ from meeting_packs import PBT, Packs, random_scores
 
 from analysis.records import ChangeRecord
 from policies.errors import CheckpointError
+from tune_jobs.ray_tune import pack_state
 from tune_jobs.ray_tune.scheduling import Standing
 from tune_jobs.search.gains import Evaluations, gains_of
 from tune_jobs.store.trial_store import TrialStore
@@ -244,6 +245,34 @@ def test_a_member_that_has_to_go_on_alone_gets_a_pack_while_the_others_wait(tmp_
     packs.run()
     assert {record.status for record in packs.records()} == {"completed"}
     assert len(packs.changes()["t0000"]) == 2
+
+
+@pytest.mark.parametrize("comes_late", [False, True])
+@pytest.mark.parametrize("slots", [2, 64])
+def test_trials_whose_node_is_not_replaced_get_the_places_of_those_that_wait_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slots: int, comes_late: bool
+) -> None:
+    score = random_scores(1)
+    packs = Packs(tmp_path / "lost", 4, score, PBT, slots=slots)
+    for pack_id in ("p00", "p01"):
+        packs.step(pack_id)
+    packs.driver.moved("p01", "Node 10.0.0.7 was lost.")
+    del packs.processes["p01"]
+    for _ in range(20):
+        packs.step("p00")
+    # Another node may come within minutes.
+    assert packs.store.pack("p01").read().trial_ids == ("t0002", "t0003")
+    assert not packs.driver.is_of_no_use("p01")
+    monkeypatch.setattr(pack_state, "_PATIENCE_S", 0.0)
+    packs.step("p00")
+    assert packs.store.pack("p01").read().trial_ids == ()
+    assert packs.driver.is_of_no_use("p01") == (slots == 64)
+    if comes_late:
+        packs.starts("p01")
+    packs.run()
+    whole = Packs(tmp_path / "whole", 4, score, PBT, slots=slots).run()
+    assert {record.status for record in packs.records()} == {"completed"}
+    assert (packs.changes(), packs.curves()) == (whole.changes(), whole.curves())
 
 
 def test_a_sweep_is_not_over_while_one_that_gave_its_place_away_waits_for_one_that_fails_for_good(

@@ -132,3 +132,17 @@ class Failing(Lone):
             os.kill(os.getpid(), signal.SIGKILL)
         if self.how == "hangs":
             time.sleep(3600)
+
+
+class EndsOnce(Lone):
+    """Its process ends in the step that finds a file, which it takes away: so one process ends, and no other."""
+
+    def __init__(self, at: str) -> None:
+        super().__init__(length=3)
+        self.at = Path(at)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self.at.exists():
+            self.at.unlink()
+            os._exit(139)
+        return super().step(action)

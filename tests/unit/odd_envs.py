@@ -265,3 +265,19 @@ class Patient(Fragile):
             return super().step({"raise": RAISE, "exit": EXIT}[self.broken])
         observation, reward, *rest = super().step(0)
         return observation, reward * (1 + int(action)), *rest
+
+
+class EndsFor(Fragile):
+    """Its process ends in the third step after a reset with one of the seeds from some number on."""
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, seed: int) -> None:
+        self.bad, self.is_bad = seed, False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.is_bad = seed is not None and seed >= self.bad
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return super().step(EXIT if self.is_bad and self.steps == 2 else 0)

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from policy_factory import make_policy
 
-from policies.acting.evaluate import evaluate_policy
+from policies.acting.baselines import ConstantPolicy
+from policies.acting.evaluate import Episodes, Evaluator, evaluate_policy
 from policies.acting.policy import RandomPolicy
 from policies.envs import modules as env_modules
 from policies.envs import own_process
@@ -28,6 +29,7 @@ from policies.envs.modules import allow_modules
 from policies.envs.wrappers import constructor_args
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.packed.envs.make import check_seedable, make_packed_envs, measure_step
+from policies.packed.evaluation import evaluate_many
 from tests.narrowing import present
 from tune_jobs.plan.env_checks import check_env_args
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -254,6 +256,19 @@ def test_whoever_is_interrupted_as_it_waits_gets_no_answer_of_before(monkeypatch
     assert not is_alive(pid)
     with pytest.raises(RuntimeError, match="its own process was killed by SIGKILL"):
         env.reset(seed=0)
+
+
+def test_one_that_ends_in_an_evaluation_fails_that_one_alone(tmp_path: Path) -> None:
+    args = {**ALONE, "at": str(tmp_path / "now"), "action_mask": False}
+    with Evaluator("lone_envs:EndsOnce", args, (1, 2)) as evaluator:
+        env = evaluator._envs[0]
+        right = ConstantPolicy(env.observation_space, env.action_space, 2, env_id="lone_envs:EndsOnce", env_args=args)
+        (tmp_path / "now").touch()
+        failed, *others = evaluate_many(evaluator, [right] * 2)
+        assert isinstance(failed, EnvFailedError)
+        assert "its own process ended with exit code 139" in failed.message
+        expected = Episodes((1, 2), (3.0, 3.0), (3, 3))
+        assert [*others, *evaluate_many(evaluator, [right])] == [expected] * 2
 
 
 def test_what_cannot_be_sent_there_is_not_sent() -> None:

@@ -6,14 +6,20 @@ it is to be compared with, the outcomes say what becomes of each. Nothing here d
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from analysis.records import FINISHED, TrialRecord
+from policies.errors import CheckpointError
 from tune_jobs.ray_tune.hyperband import HyperBand
-from tune_jobs.ray_tune.population import Population
+from tune_jobs.ray_tune.population import Change, Population, take_over
 from tune_jobs.ray_tune.scheduling import CopyFrom, Decision, NobodyWaits, Scheduler, Standing
+from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.store.contract import Assignment, Sweep
+
+_LOG = logging.getLogger(__name__)
 
 Outcome = Decision | CopyFrom
 
@@ -77,6 +83,34 @@ def meeting_of(scheduler: Scheduler) -> Meeting | None:
     if isinstance(scheduler, HyperBand):
         return HyperBandMeeting(scheduler)
     return None
+
+
+def assignment_of(records: Sequence[TrialRecord], num_failures: dict[str, int], meeting: Meeting | None) -> Assignment:
+    """Return what a pack is told of its trials: with a meeting, where each waits, and how often it was changed.
+
+    Args:
+        records: The trials, in their order in the pack.
+        num_failures: How often each has failed; those that have not are left out.
+        meeting: Where they wait for each other; None: nowhere.
+    """
+    trial_ids = tuple(record.trial_id for record in records)
+    if meeting is None:
+        return Assignment(trial_ids, num_failures)
+    due = {trial_id: meeting.due_at(trial_id) for trial_id in trial_ids}
+    return Assignment(
+        trial_ids,
+        num_failures,
+        {trial_id: steps for trial_id, steps in due.items() if steps is not None},
+        {record.trial_id: len(record.changes) for record in records if record.changes},
+    )
+
+
+def goes_on_from(outcome: CopyFrom, spec: SweepSpec, store: Sweep, record: TrialRecord, change: Change) -> None:
+    """Let a trial go on from another's copy, see `take_over`; as it is, where there is nothing to copy."""
+    try:
+        take_over(spec, store, record, outcome, change)
+    except CheckpointError as error:
+        _LOG.warning("%s goes on as it is: %s", record.trial_id, error)
 
 
 @dataclass(frozen=True)

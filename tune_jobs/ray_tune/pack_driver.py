@@ -5,7 +5,8 @@ so a decision takes effect in the pack's next step. The sweep's own scheduler (`
 compares the members, whichever pack they are in.
 
 On a cluster there may be more packs than the nodes hold, which Tune starts on nodes that join: they train trials that
-wait, and those of a pack that has lost its node and got no other. A trial that a process trains stays with it.
+wait, and those of a pack that has lost its node and got no other. A trial that a process trains stays with it. Where
+trials wait for each other, those of such a pack are given places of those that wait for them, after a while.
 
 A pack whose process died is started again, and its members go on from their latest checkpoints. One of them may be
 the cause: a member that was twice in a pack that died continues alone, and only its failures alone count against its
@@ -14,28 +15,23 @@ retries.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from policies.errors import CheckpointError
 from tune_jobs.plan.engine_choice import PackPlan
-from tune_jobs.ray_tune.meetings import compared_with, meeting_of
+from tune_jobs.ray_tune.meetings import assignment_of, compared_with, goes_on_from, meeting_of
 from tune_jobs.ray_tune.pack_failures import PackFailures
 from tune_jobs.ray_tune.pack_state import PackState, Tell
-from tune_jobs.ray_tune.population import take_over
 from tune_jobs.ray_tune.scheduling import CopyFrom, Decision, NobodyWaits, Scheduler, Standing
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store import transitions
 from tune_jobs.store.candidates import candidates
-from tune_jobs.store.contract import Assignment, Sweep
+from tune_jobs.store.contract import Sweep
 from tune_jobs.store.progress import Progress
 from tune_jobs.store.record_keeper import RecordKeeper
 from tune_jobs.training.pack_loop import MemberReport
-
-_LOG = logging.getLogger(__name__)
 
 
 class PackDriver:
@@ -119,7 +115,7 @@ class PackDriver:
         pack = self._packs[pack_id]
         if not pack.members:
             self._begin(pack)
-        pack.is_up = True
+        pack.began()
         for trial_id in pack.members:
             self._keeper.started(trial_id)
 
@@ -181,7 +177,7 @@ class PackDriver:
     def died(self, pack_id: str, error: str) -> None:
         """Handle the death of a pack's process, or an error of no single member; the pack is started again."""
         pack = self._packs[pack_id]
-        pack.is_up, pack.tell = False, None
+        pack.ended()
         in_company = len(pack.members) > 1
         for trial_id in list(pack.ending):
             self._stopped(pack, trial_id)
@@ -217,7 +213,7 @@ class PackDriver:
 
     def _restarts(self, pack_id: str, note: Callable[[str], None]) -> None:
         pack = self._packs[pack_id]
-        pack.is_up, pack.tell = False, None
+        pack.ended()
         for trial_id in list(pack.ending):
             # The next process is not told of them, so none would report their end.
             self._stopped(pack, trial_id)
@@ -230,7 +226,7 @@ class PackDriver:
     def closed(self, pack_id: str) -> None:
         """Handle a pack that Tune has ended: it has nothing to do, or the sweep stops and it did not save in time."""
         pack = self._packs[pack_id]
-        pack.is_up, pack.tell = False, None
+        pack.ended()
         for trial_id in list(pack.members):
             self._keeper.ended(trial_id)
             self._left(trial_id, for_good=True)
@@ -264,7 +260,8 @@ class PackDriver:
         if trial_id in pack.ending:
             self._stopped(pack, trial_id)
             return
-        self._failures.failed(trial_id)
+        if report.counts:
+            self._failures.failed(trial_id)
         self._left(trial_id, for_good=not report.retried)
         self._keeper.failed(trial_id, report.error or "", retried=report.retried, reached=report.reached)
         if not report.retried or self._keeper.stop_requested():
@@ -306,7 +303,7 @@ class PackDriver:
                 self._end(pack, trial_id)
             else:
                 if isinstance(outcome, CopyFrom):
-                    self._take_over(trial_id, outcome)
+                    goes_on_from(outcome, self._spec, self._store, self._keeper.record(trial_id), self._keeper.change)
                 self._goes_on(trial_id)
         for pack in self._packs.values():
             if pack.is_up:
@@ -332,11 +329,18 @@ class PackDriver:
             self._outside.discard(trial_id)
             (self._alone if self._failures.is_alone(trial_id) else self._waiting).append(trial_id)
 
-    def _take_over(self, trial_id: str, outcome: CopyFrom) -> None:
-        try:
-            take_over(self._spec, self._store, self._keeper.record(trial_id), outcome, self._keeper.change)
-        except CheckpointError as error:
-            _LOG.warning("%s goes on as it is: %s", trial_id, error)
+    def _take_in(self, pack: PackState) -> None:
+        """Let trials whose pack gets no process have places in one where all wait, maybe for them."""
+        if self._waiting or self._alone or not all(trial_id in self._arrived for trial_id in pack.staying):
+            return
+        for other in self._packs.values():
+            if other.is_given_up:
+                for trial_id in tuple(other.members):
+                    self._leave(other, trial_id)
+                    # Nobody trains it, as if it had given its place away.
+                    self._outside.add(trial_id)
+                    self._goes_on(trial_id)
+                self._write(other)
 
     def _make_room(self, pack: PackState) -> None:
         """Let members that wait for others give their places to trials that have none; they are saved."""
@@ -360,6 +364,8 @@ class PackDriver:
         """Assign more trials to a pack; a trial that has to run alone is assigned only to an empty pack."""
         if self._keeper.stop_requested():
             return
+        if self._meeting is not None and pack.is_up:
+            self._take_in(pack)
         if self._arrived:
             self._make_room(pack)
         staying = pack.staying
@@ -384,17 +390,6 @@ class PackDriver:
             self._keeper.started(trial_id)
 
     def _write(self, pack: PackState, *, soon: bool = False) -> None:
-        pack.assign(self._assignment(pack.staying), self._keeper.owned, soon=soon)
-
-    def _assignment(self, trial_ids: tuple[str, ...]) -> Assignment:
-        failures = self._failures.of(trial_ids)
-        if self._meeting is None:
-            return Assignment(trial_ids, failures)
-        due = {name: self._meeting.due_at(name) for name in trial_ids}
-        changes = {name: len(self._keeper.record(name).changes) for name in trial_ids}
-        return Assignment(
-            trial_ids,
-            failures,
-            {name: steps for name, steps in due.items() if steps is not None},
-            {name: number for name, number in changes.items() if number},
-        )
+        records = [self._keeper.record(trial_id) for trial_id in pack.staying]
+        assignment = assignment_of(records, self._failures.of(pack.staying), self._meeting)
+        pack.assign(assignment, self._keeper.owned, soon=soon)

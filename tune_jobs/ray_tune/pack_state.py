@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 from tune_jobs.store.contract import Assignment, Pack
+
+_PATIENCE_S = 300.0
+"""How long a pack keeps its members without a process: Tune begins one at once, or as soon as another node has come.
+
+By then a node that an autoscaler starts is there. Who gives them away earlier may have no use for that node any more.
+"""
 
 Tell = Callable[[Assignment], object]
 """Tells the process of a pack which trials it has to train, before it trains on."""
@@ -29,6 +36,20 @@ class PackState:
         self.told: Assignment | None = None
         """What it was told last; None: nothing yet."""
         self._written: Assignment | None = None
+        self._ended_at: float | None = None
+
+    def began(self) -> None:
+        """Note that its process runs."""
+        self.is_up, self._ended_at = True, None
+
+    def ended(self) -> None:
+        """Note that its process has ended; Tune may begin another one."""
+        self.is_up, self.tell, self._ended_at = False, None, time.monotonic()
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether it has members, and its process ended so long ago that no other one is to be expected."""
+        return bool(self.members) and self._ended_at is not None and time.monotonic() - self._ended_at >= _PATIENCE_S
 
     @property
     def staying(self) -> tuple[str, ...]:

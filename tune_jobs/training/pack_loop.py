@@ -22,6 +22,7 @@ from policies.acting.evaluate import Episodes, Evaluator
 from policies.acting.policy import Policy
 from policies.envs.tallies import Reached, evaluating, tally_of
 from policies.errors import NonFiniteWeightsError, TuneJobsError, said_by
+from policies.packed.envs.sub_envs import HostDiedError
 from tune_jobs.store.contract import Ownership
 from tune_jobs.store.logs import built_from
 from tune_jobs.store.opening import open_sweep
@@ -51,6 +52,8 @@ class MemberReport:
     """How far a member that failed had come; None: it is not known here."""
     retried: bool = False
     """Whether it is retried from its latest checkpoint: at once, or when the sweep is resumed if it had to leave."""
+    counts: bool = True
+    """Whether the failure counts against its retries; not if another member may be what ended a process of both."""
     lost: bool = False
     """Whether another process has taken it over; it has not failed, and nothing more about it is known here."""
     waits: bool = False
@@ -329,12 +332,14 @@ class PackLoop:
             del self._members[member.task.trial_id]
             return
         _log(member.task, "".join(traceback.format_exception(error)).rstrip())
-        member.num_failures += 1
-        retried = leaves or member.num_failures <= self._max_retries
+        # Each of them is given a process of its own now, so that the next death there is that of one alone.
+        counts = not (isinstance(error, HostDiedError) and error.in_company)
+        member.num_failures += counts
+        retried = leaves or not counts or member.num_failures <= self._max_retries
         trial_id, tally = member.task.trial_id, tally_of(member.task.trial_id)
         reached = None if tally is None else tally.reached
         message = _describe(member.task, error)
-        self._reports.append(MemberReport(trial_id, error=message, reached=reached, retried=retried))
+        self._reports.append(MemberReport(trial_id, error=message, reached=reached, retried=retried, counts=counts))
         if leaves or not retried:
             self._let_go(member)
         else:

@@ -56,6 +56,8 @@ class PackedEngine:
         self._before: dict[str, tuple[int, int]] = {}
         """Env steps and iterations of a trial that its member does not count; negative if it counts another's."""
         self._num_stacks = itertools.count()
+        # Of all stacks: one whose members all fail is gone, and they are added to another.
+        self._suspects: set[str] = set()
         self.moved: Collection[str] = ()
         """The members that the last iteration moved to another stack."""
 
@@ -123,6 +125,7 @@ class PackedEngine:
             atari_training=task.atari_training,
             kind=kind,
             num_processes=self._num_env_processes,
+            suspects=self._suspects,
         )
         return make_stack(hyperparams, envs, device)
 

@@ -75,6 +75,7 @@ def make_packed_envs(
     atari_training: Mapping[str, bool] | None = None,
     kind: EnvKind,
     num_processes: int = 0,
+    suspects: set[str] | None = None,
 ) -> PackedEnvs:
     """Make the environments of a pack that has no members yet.
 
@@ -88,6 +89,8 @@ def make_packed_envs(
         kind: `vectorised`: only classic control, all members in one object. `scalar`: any environment, one
             sub-environment after the other. `processes`: the same, in child processes; if it is one, half of them.
         num_processes: The number of child processes of the kind `processes`, at least 1.
+        suspects: Members that were in a child process that died, which are added here: each gets one of its own. None:
+            none yet.
 
     Raises:
         EnvError: The environment cannot be made, is not one of that kind, or there is a penalty and it has no failure.
@@ -103,7 +106,7 @@ def make_packed_envs(
     num_processes = max(1, num_processes) if kind == "processes" else 0
     return ScalarEnvs(
         env_id, env_args, num_envs,
-        failure_penalty=failure_penalty, atari_training=atari_training, num_processes=num_processes,
+        failure_penalty=failure_penalty, atari_training=atari_training, num_processes=num_processes, suspects=suspects,
     )  # fmt: skip
 
 

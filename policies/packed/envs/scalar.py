@@ -60,6 +60,7 @@ class ScalarEnvs:
         failure_penalty: Reward of steps that end by failure; None: the env's own reward.
         atari_training: The arguments of an `AtariTraining`, whose learner these are stepped for; None: there is none.
         num_processes: Processes to step them in; 0: in this one. One shares them with this one.
+        suspects: The members that had a sub-environment in a process that died, which are added here; None: none yet.
         rows: Steps all of them at once, in this process; None: one is stepped after the other.
 
     Raises:
@@ -75,6 +76,7 @@ class ScalarEnvs:
         failure_penalty: float | None = None,
         atari_training: Mapping[str, bool] | None = None,
         num_processes: int = 0,
+        suspects: set[str] | None = None,
         rows: ClassicRows | None = None,
     ) -> None:
         self._env_id, self._env_args = env_id, dict(env_args or {})
@@ -91,7 +93,7 @@ class ScalarEnvs:
         self._members = MemberRows(num_envs)
         self._num_processes = num_processes
         self._parts: list[_Part] = [] if rows is None else [_Part(HereHost(ClassicSubEnvs(rows, env_id)))]
-        self._suspects: set[str] = set()
+        self._suspects = set() if suspects is None else suspects
         self._tallies: dict[str, Tally] = {}
         self.observations: NDArray[Any] = self._zeros(0)
 
@@ -106,7 +108,10 @@ class ScalarEnvs:
         shares = self._share_out(member_id)
         parts = [part for part, _ in shares]
         answers = self._ask(
-            parts, "add", [(member_id, [(seed + place) % _NUM_SEEDS for place in places]) for _, places in shares]
+            parts,
+            "add",
+            [(member_id, [(seed + place) % _NUM_SEEDS for place in places]) for _, places in shares],
+            beside=[member_id],
         )
         firsts = self._zeros(self.num_envs)
         problem: EnvError | None = None
@@ -231,8 +236,17 @@ class ScalarEnvs:
             rows = [self._members.of(member_id).start + place for member_id, place in part.owners]
             part.rows = np.array(rows, dtype=np.intp)
 
-    def _ask(self, parts: Sequence[_Part], method: str, args: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Call a method of several hosts and return their results; where a host raised an `EnvError`, the error."""
+    def _ask(
+        self, parts: Sequence[_Part], method: str, args: Sequence[tuple[Any, ...]], *, beside: Sequence[str] = ()
+    ) -> list[Any]:
+        """Call a method of several hosts and return their results; where a host raised an `EnvError`, the error.
+
+        Args:
+            parts: The hosts.
+            method: The method.
+            args: Its arguments for each host.
+            beside: Members that may end the hosts, beside those that have sub-environments there.
+        """
         answers: list[Any] = [None] * len(parts)
         for index, part in enumerate(parts):
             try:
@@ -251,6 +265,7 @@ class ScalarEnvs:
                 part.host.close()
                 self._parts.remove(part)
                 members = dict.fromkeys(member_id for member_id, _ in part.owners)
+                answer.in_company = len(members.keys() | set(beside)) > 1
                 self._suspects.update(members)
                 self._fail(members, answer)
         return answers
@@ -269,7 +284,7 @@ class ScalarEnvs:
         for part in [part for part in self._parts if any(owner == member_id for owner, _ in part.owners)]:
             part.owners = [pair for pair in part.owners if pair[0] != member_id]
             if part.alone_for is None:
-                self._ask([part], "remove", [(member_id,)])
+                self._ask([part], "remove", [(member_id,)], beside=[member_id])
         for part in [part for part in self._parts if part.alone_for == member_id]:
             part.host.close()
             self._parts.remove(part)

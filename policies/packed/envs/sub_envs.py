@@ -20,6 +20,9 @@ from policies.errors import EnvError
 class HostDiedError(EnvError):
     """A process that steps sub-environments has ended."""
 
+    in_company = False
+    """Whether it had sub-environments of several members, any of which may have ended it."""
+
 
 class Host(Protocol):
     """Runs some sub-environments, in this process or in another.
