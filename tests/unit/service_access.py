@@ -1,5 +1,6 @@
 """For the tests of access: applications with other settings over one service, tokens, raw requests."""
 
+import contextlib
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping
@@ -12,6 +13,8 @@ import anyio
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from sqlalchemy import Engine, event
+from sqlalchemy.exc import OperationalError
 from starlette.types import ASGIApp, Message
 from sweep_folders import make_sweep_folder
 
@@ -97,6 +100,23 @@ def make_token(storage: Path, name: str, role: Role) -> str:
     """The secret of a new token for the service of a storage folder, which need not run yet."""
     with opened_gate(ServiceConfig(storage=storage)) as gate:
         return gate.tokens.make(name, role)[1]
+
+
+@contextlib.contextmanager
+def no_space_for_tokens(engine: Engine) -> Iterator[list[str]]:
+    """Let the disk be full for whatever changes tokens, for the block; yields the statements that were refused."""
+    refused: list[str] = []
+
+    def refuse(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+        if statement.startswith("UPDATE tokens"):
+            refused.append(statement)
+            raise OperationalError(statement, None, Exception("database or disk is full"))
+
+    event.listen(engine, "before_cursor_execute", refuse)
+    try:
+        yield refused
+    finally:
+        event.remove(engine, "before_cursor_execute", refuse)
 
 
 def bearer(secret: str) -> dict[str, str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from databases import database_url, postgresql  # noqa: F401 (fixtures)
 from fake_sweeps import RunCommand
-from service_access import Clock
+from service_access import Clock, no_space_for_tokens
 from sqlalchemy import Engine, select
 
 from policies.errors import CannotRunError, NotFoundError, SpecError
@@ -134,6 +134,20 @@ def test_the_last_use_is_noted_to_the_minute(engine: Engine) -> None:
         clock.s += passed
         tokens.find(secret)
         assert tokens.all()[0].last_used_at == noted
+
+
+def test_a_token_is_found_where_its_use_can_not_be_noted(engine: Engine) -> None:
+    tokens = Tokens(engine)
+    token, secret = tokens.make("ann", "viewer")
+    with no_space_for_tokens(engine) as refused:
+        found = tokens.find(secret)
+    assert len(refused) == 1
+    assert found == token
+    known = tokens.remembered(secret)
+    assert known is not None
+    assert known[1]
+    tokens.find(secret)
+    assert tokens.all()[0].last_used_at is not None
 
 
 @pytest.mark.parametrize("name", ["", " ", "a b", "<b>", "a\nb", "a/b", "-a", "a" * 101, "local", "a\0", "'; --"])

@@ -12,9 +12,11 @@ import pytest
 from databases import PostgreSQL, started_or_skip
 from fake_sweeps import RunCommand
 from fastapi.testclient import TestClient
+from service_access import bearer, no_space_for_tokens, place
 from services import FAKE, client, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
+from tune_jobs.service.access.tokens import FRESH_S
 from tune_jobs.service.database import opening
 from tune_jobs.service.database.opening import open_database, sqlite_url
 from tune_jobs.service.driver import _ended
@@ -117,6 +119,19 @@ def test_a_database_without_space_says_so(client: TestClient, service: Service, 
         assert "disk" in problem(answer, 507)["detail"]
         assert client.get("/api/v1/sweeps/done").status_code == 200
     assert client.patch("/api/v1/sweeps/done", json={"note": "z"}).json()["note"] == "z"
+
+
+def test_who_has_a_token_looks_and_deletes_where_its_use_can_not_be_noted(service: Service, finished: str) -> None:
+    at = place(service, require_token=True)
+    headers = bearer(at.token("admin"))
+    with no_space_for_tokens(service.engine) as refused:
+        answer = at.client().get("/api/v1/sweeps", headers=headers)
+        assert answer.status_code == 200, answer.text
+        # Else it would be believed, and not looked up.
+        at.clock.s += FRESH_S
+        assert at.client().delete("/api/v1/sweeps/done?force=true", headers=headers).status_code == 204
+    assert len(refused) == 2
+    assert not (Path(service.config.storage) / "done").exists()
 
 
 @contextlib.contextmanager

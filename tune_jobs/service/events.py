@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from policies.errors import TuneJobsError
+from tune_jobs.service.ending import join
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.outages import Outages
 from tune_jobs.service.queue import Queue
@@ -61,8 +62,7 @@ class Watch:
     def close(self) -> None:
         """End."""
         self._end.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        join(self._thread)
 
     def ended(self, job: Job) -> None:
         """Tell that a job has ended."""

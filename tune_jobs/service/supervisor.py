@@ -18,6 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from policies.errors import TuneJobsError, fit
 from tune_jobs.service.draining import Draining
+from tune_jobs.service.ending import join, within
 from tune_jobs.service.job_files import JobFiles, held_jobs, remove_ended
 from tune_jobs.service.jobs import Job, Outcome
 from tune_jobs.service.outages import Outages
@@ -111,8 +112,8 @@ class Supervisor:
         if draining.ask():
             return True
         try:
-            return bool(self._queue.jobs("running"))
-        except SQLAlchemyError as error:
+            return bool(within(lambda: self._queue.jobs("running")))
+        except (SQLAlchemyError, TuneJobsError) as error:
             # What saved is in the jobs' files, too, which the next start looks at.
             self._outages.failed(_LOOKING, error)
             return False
@@ -121,8 +122,7 @@ class Supervisor:
         """End the thread; drivers live on."""
         self._end.set()
         self.wake()
-        if self._thread.is_alive():
-            self._thread.join()
+        join(self._thread)
         spare, self._spare = self._spare, None
         if spare is not None:
             spare.dismiss()
@@ -212,11 +212,14 @@ class Supervisor:
         for pid in [pid for pid, child in self._children.items() if child.poll() is not None]:
             del self._children[pid]
         for job in self._queue.jobs("running"):
+            if self._end.is_set():
+                # The database was silent for long: another service may have it by now.
+                return
             with self._apart(job.sweep):
                 self._look_at(job)
         # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
         free = {name for name in {job.sweep for job in self._queue.jobs("waiting")} if self._may_run(name)}
-        while not self._draining.is_set():
+        while not (self._draining.is_set() or self._end.is_set()):
             claimed = self._queue.claim(self._where.num_cpus, free.__contains__)
             if claimed is None:
                 break

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from sqlalchemy import Engine, delete, func, insert, or_, select, update
+from sqlalchemy import Engine, RowMapping, delete, func, insert, or_, select, update
 
 from policies.errors import SpecError, said_by
 from tune_jobs.service.database.tables import messages
@@ -51,6 +51,8 @@ _KILLED_S = 5.0
 """How long a killed command may take to be gone."""
 _READ_BYTES = 2_000
 """Of what a command wrote to its standard error, from the end."""
+_AT_ONCE = 100
+"""How many messages a target is sent at most before the others have their turn."""
 _KEPT_S = 7 * 24 * 3_600.0
 _SENDING = "Messages can't be sent"
 _log = logging.getLogger(__name__)
@@ -217,30 +219,45 @@ class Teller:
         with self._engine.begin() as connection:
             done = or_(messages.c.next_at.is_(None), messages.c.target.not_in(self._targets))
             connection.execute(delete(messages).where(done, messages.c.created_at < now - _KEPT_S))
-            query = select(messages).where(messages.c.next_at <= now, messages.c.target.in_(self._targets))
-            due = connection.execute(query.order_by(messages.c.created_at).limit(100)).mappings().all()
-        arrived = 0
-        for row in due:
-            if self._end.is_set():
+            query = select(messages).where(messages.c.next_at <= now).order_by(messages.c.created_at).limit(_AT_ONCE)
+            due = [
+                connection.execute(query.where(messages.c.target == target)).mappings().all()
+                for target in dict.fromkeys(self._targets)
+            ]
+        return sum(self._send(rows) for rows in due)
+
+    def _send(self, rows: Sequence[RowMapping]) -> int:
+        """Send messages of one target until one does not arrive, or it took long; return how many arrived.
+
+        The others wait for it meanwhile, and a receiver that is dead takes a timeout for each message: what is left is
+        due in the next round.
+        """
+        began, arrived = self._now(), 0
+        for row in rows:
+            if self._end.is_set() or self._now() - began > _TIMEOUT_S or not self._attempt(row):
                 break
-            try:
-                error = self._sent(row["id"], row["event"], row["target"], row["body"])
-            except Exception as raised:  # noqa: BLE001 (whatever it is, the other messages have to be sent)
-                error = f"unexpected {type(raised).__name__}: {said_by(raised)}"[:500]
-            attempts = row["num_attempts"] + 1
-            arrived += error is None
-            wait = None if error is None or attempts > len(WAITS_S) else WAITS_S[attempts - 1]
-            delivery: Delivery = "arrived" if error is None else "given_up" if wait is None else "failed"
-            self._on_attempt("command" if row["target"].startswith(COMMAND) else "webhook", delivery)
-            if error is not None:
-                told = (told_target(row["target"]), row["event"], attempts, error)
-                _log.warning("%s could not be told %s (attempt %d): %s", *told)
-            values = {
-                "num_attempts": attempts, "error": error, "next_at": None if wait is None else self._now() + wait,
-            }  # fmt: skip
-            with self._engine.begin() as connection:
-                connection.execute(update(messages).where(messages.c.id == row["id"]).values(values))
+            arrived += 1
         return arrived
+
+    def _attempt(self, row: RowMapping) -> bool:
+        """Send one message, and note what came of it; return whether it arrived."""
+        try:
+            error = self._sent(row["id"], row["event"], row["target"], row["body"])
+        except Exception as raised:  # noqa: BLE001 (whatever it is, the other messages have to be sent)
+            error = f"unexpected {type(raised).__name__}: {said_by(raised)}"[:500]
+        attempts = row["num_attempts"] + 1
+        wait = None if error is None or attempts > len(WAITS_S) else WAITS_S[attempts - 1]
+        delivery: Delivery = "arrived" if error is None else "given_up" if wait is None else "failed"
+        self._on_attempt("command" if row["target"].startswith(COMMAND) else "webhook", delivery)
+        if error is not None:
+            told = (told_target(row["target"]), row["event"], attempts, error)
+            _log.warning("%s could not be told %s (attempt %d): %s", *told)
+        values = {
+            "num_attempts": attempts, "error": error, "next_at": None if wait is None else self._now() + wait,
+        }  # fmt: skip
+        with self._engine.begin() as connection:
+            connection.execute(update(messages).where(messages.c.id == row["id"]).values(values))
+        return error is None
 
     def _sent(self, message_id: str, event: str, target: str, body: str) -> str | None:
         """Send one message; return why it did not arrive, if it did not."""

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from tune_jobs.service.ending import tell_left
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.labels import Labels
 from tune_jobs.service.queue import Queue
@@ -29,6 +30,8 @@ AWAITED_S = 300.0
 of which there may be many and the way long, and without what came since they would have to begin anew."""
 MOST_UNWATCHED = 32
 """How many are followed that nobody watches."""
+_END_S = 2.0
+"""How long all that follow are waited for as they end: sweeps save after that, and a silent database holds a look."""
 _MOST_WAIT_S = 5.0
 _SHARE = 0.05
 """The share of a core that following one thing takes, unless it would be too old then."""
@@ -46,7 +49,7 @@ class Follower:
     """
 
     def __init__(self, what: str, view: View, log: EventLog) -> None:
-        self._what, self._view, self.log = what, view, log
+        self.what, self._view, self.log = what, view, log
         self.used_at = time.monotonic()
         self._awaited_until = self.used_at
         self._looking = threading.Lock()
@@ -66,7 +69,7 @@ class Follower:
                     self.log.add(self._view.changes())
                 # The first look at a large sweep may take longer than one lingers.
                 self.used_at = time.monotonic()
-                thread = threading.Thread(target=self._run, name=f"watch {self._what}", daemon=True)
+                thread = threading.Thread(target=self._run, name=f"watch {self.what}", daemon=True)
                 # Another thread, which closes all, may join it as soon as it is known.
                 thread.start()
                 self._thread = thread
@@ -76,10 +79,11 @@ class Follower:
         self._over.set()
         self.log.end()
 
-    def join(self) -> None:
-        """Wait for the end of the thread."""
+    def join(self, limit_s: float | None = None) -> bool:
+        """Wait for the end of the thread, at most so long; return whether it has come."""
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(limit_s)
+        return self._thread is None or not self._thread.is_alive()
 
     @property
     def is_watched(self) -> bool:
@@ -110,13 +114,13 @@ class Follower:
                 if not isinstance(error, CheckpointError):
                     self.log.add([("deleted", {})])
                     break
-                _log.warning("%s can't be followed just now: %s", self._what, error)
+                _log.warning("%s can't be followed just now: %s", self.what, error)
                 wait_s, has_failed = _MOST_WAIT_S, True
             except CannotRunError as error:
-                _log.warning("%s can't be followed just now: %s", self._what, error)
+                _log.warning("%s can't be followed just now: %s", self.what, error)
                 wait_s, has_failed = _MOST_WAIT_S, True
             except Exception:  # noqa: BLE001 (such as a database that is away for a while)
-                _log.exception("%s could not be looked at; it is tried again.", self._what)
+                _log.exception("%s could not be looked at; it is tried again.", self.what)
                 wait_s, has_failed = _MOST_WAIT_S, True
             else:
                 has_failed = False
@@ -176,14 +180,16 @@ class Watching:
         return self._num_watchers
 
     def close(self) -> None:
-        """End all streams, and those that come later at once."""
+        """End all streams, and those that come later at once; what still looks after a moment is left to itself."""
         with self._lock:
             self._is_closed = True
             watches = list(self._watches.values())
         for watch in watches:
             watch.end()
-        for watch in watches:
-            watch.join()
+        deadline = time.monotonic() + _END_S
+        left = [watch.what for watch in watches if not watch.join(max(0.0, deadline - time.monotonic()))]
+        if left:
+            tell_left([f"looks at {what}" for what in left], _END_S)
 
     def _watch(self, name: str | None) -> Follower:
         with self._lock:

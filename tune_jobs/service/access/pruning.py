@@ -8,6 +8,7 @@ import threading
 from sqlalchemy.exc import SQLAlchemyError
 
 from tune_jobs.service.access.audit import Audit
+from tune_jobs.service.ending import join
 
 PAUSE_S = 86_400.0
 _RETRY_S = 600.0
@@ -35,8 +36,7 @@ class Pruning:
     def close(self) -> None:
         """End."""
         self._end.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        join(self._thread)
 
     def prune(self) -> int:
         """Remove what is old enough; return how many entries that were."""

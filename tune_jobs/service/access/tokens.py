@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import re
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 from sqlalchemy import Engine, func, insert, or_, select, update
+from sqlalchemy.exc import SQLAlchemyError
 
 from policies.errors import NotFoundError, SpecError
 from tune_jobs.service.access.callers import LOCAL, Caller, Role
@@ -147,12 +149,17 @@ class Tokens:
                 with self._lock:
                     self._known.pop(digest, None)
                 return None
-            token, now = _token(row), self.now()
-            if token.state(now) == "valid" and not 0 <= now - (token.last_used_at or 0.0) < _USED_S:
-                connection.execute(update(tokens).where(tokens.c.id == token.id).values(last_used_at=now))
+        token, now = _token(row), self.now()
+        if token.state(now) == "valid" and not 0 <= now - (token.last_used_at or 0.0) < _USED_S:
+            self._note_use(token, now)
         with self._lock:
             self._known[digest] = (token, now)
         return token
+
+    def _note_use(self, token: Token, now: float) -> None:
+        # With a full disk nothing can be noted, and people have to get in to make room.
+        with contextlib.suppress(SQLAlchemyError), self._engine.begin() as connection:
+            connection.execute(update(tokens).where(tokens.c.id == token.id).values(last_used_at=now))
 
 
 def _digest(secret: str) -> str:

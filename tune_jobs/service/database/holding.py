@@ -15,6 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from policies.errors import CannotRunError
 from tune_jobs.service.database.opening import reason_of
+from tune_jobs.service.ending import END_S, within
 
 _log = logging.getLogger(__name__)
 _KEY = 0x74756E652D6A6F62
@@ -88,7 +89,10 @@ def held(engine: Engine) -> Iterator[Hold]:
             _wait_for(hold)
             yield hold
     finally:
-        hold.close()
+        # Where the thread of the queue still waits for an answer over its connection, closing waits for that, too; the
+        # server frees the lock as the process ends.
+        with contextlib.suppress(CannotRunError):
+            within(hold.close, END_S)
 
 
 def _wait_for(hold: Hold) -> None:

@@ -25,6 +25,13 @@ BUSY_TIMEOUT_S = 10.0
 """How long a call waits for another process that writes."""
 TURN_TIMEOUT_S = 20.0
 """How long a thread waits for its turn at a file that others of its process use."""
+_PATIENCE = {
+    "connect_timeout": 10, "keepalives_idle": 15, "keepalives_interval": 5, "keepalives_count": 3,
+    "tcp_user_timeout": 20_000,
+}  # fmt: skip
+"""What libpq gets where the URL doesn't say: a server that is gone is noticed within half a minute, not a quarter of an
+hour. All in seconds, but the last in milliseconds."""
+_LIBPQ = ("postgresql+psycopg", "postgresql+psycopg2")
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
@@ -74,7 +81,8 @@ def open_database(url: str) -> Engine:
         # SQLite lets one transaction at a time write, and whoever waits for it looks now and then, and may find it
         # taken each time: threads of this process queue for one connection instead.
         one: dict[str, Any] = {"pool_size": 1, "max_overflow": 0, "pool_timeout": TURN_TIMEOUT_S}
-        engine = create_engine(parsed, pool_pre_ping=True, hide_parameters=True, **(one if _is_in_file(parsed) else {}))
+        settings = one if _is_in_file(parsed) else {"connect_args": _patience(parsed)}
+        engine = create_engine(parsed, pool_pre_ping=True, hide_parameters=True, **settings)
     except (ArgumentError, NoSuchModuleError, ValueError) as error:
         raise CannotRunError(
             f"{Redaction()(url)!r} is no database URL.", "Give sqlite:///FILE or postgresql://USER@HOST/NAME."
@@ -101,6 +109,12 @@ def open_database(url: str) -> Engine:
         engine.dispose()
         raise
     return engine
+
+
+def _patience(url: URL) -> dict[str, Any]:
+    if url.drivername not in _LIBPQ:
+        return {}
+    return {name: value for name, value in _PATIENCE.items() if name not in url.query}
 
 
 def _is_in_file(url: URL) -> bool:
