@@ -79,3 +79,15 @@ def test_whoever_is_with_others_in_a_process_that_dies_is_known(make: Callable[.
     os.kill(present(process.pid), signal.SIGKILL)
     go_on(more)
     assert not in_company(more.errors["a"])
+
+
+def test_who_finds_several_processes_dead_was_in_company(make: Callable[..., PackedEnvs]) -> None:
+    envs = make("odd_envs:Fragile", "processes", num_envs=2, members={"a": 1, "b": 2}, num_processes=2)
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join()
+    with pytest.raises(HostDiedError) as failure:
+        envs.add("c", 3)
+    assert in_company(failure.value)
+    assert all(in_company(error) for error in envs.errors.values())
+    assert set(envs.errors) == {"a", "b"}

@@ -1,7 +1,8 @@
 """Wait for threads and calls as the service ends, but for none without end: a silent database may hold them.
 
 Threads that are left are daemons, and end with the process; what they were about is found again at the next start, as
-after a kill.
+after a kill. Only a request that waits itself, in a thread that is none, holds the end of the process: all has saved by
+then, and whoever sent the signal may kill it.
 """
 
 from __future__ import annotations

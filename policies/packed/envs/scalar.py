@@ -259,13 +259,16 @@ class ScalarEnvs:
                     answers[index] = part.host.receive()
                 except EnvError as error:
                     answers[index] = error
+        # Of all, as asking hosts again may find one of them dead a second time, by another error.
+        for part, answer in zip(parts, answers, strict=True):
+            if isinstance(answer, HostDiedError):
+                answer.in_company = len({member_id for member_id, _ in part.owners}.union(beside)) > 1
         # Only after all answers, because handling a failure asks hosts again.
         for part, answer in zip(parts, answers, strict=True):
             if isinstance(answer, HostDiedError) and part in self._parts:
                 part.host.close()
                 self._parts.remove(part)
                 members = dict.fromkeys(member_id for member_id, _ in part.owners)
-                answer.in_company = len(members.keys() | set(beside)) > 1
                 self._suspects.update(members)
                 self._fail(members, answer)
         return answers
