@@ -104,7 +104,8 @@ def test_copies_that_are_to_go_while_an_older_checkpoint_is_uploaded_go_with_the
         trial.remove_copies()
 
     def look() -> None:
-        seen.append(opened().trial("t0000").copied_checkpoint(5).exists())
+        reader = opened().trial("t0000")  # its files go with it
+        seen.append(reader.copied_checkpoint(5).exists())
 
     faults.rule("slow", kinds="PUT", keys="/t0000/head.json$", then=go_on)
     faults.rule("slow", kinds="PUT", keys="/t0000/head.json$", then=look)

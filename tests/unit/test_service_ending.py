@@ -136,6 +136,7 @@ def test_a_look_that_outlived_its_service_changes_nothing(place: Place, monkeypa
         service._look()
     assert [(item.id, item.state, item.num_attempts) for item in jobs("running")] == [(job.id, "running", 1)]
     place.queue.end(job.id, "stopped")
+    service = place.new_service(num_cpus=8.0)
     with monkeypatch.context() as patch:
         patch.setattr(place.queue, "jobs", late)
         service._look()
@@ -185,7 +186,6 @@ def test_what_a_call_returns_or_raises_is_passed_on() -> None:
     ("?connect_timeout=3&tcp_user_timeout=0", {"connect_timeout": "3", "tcp_user_timeout": "0"}),
 ])  # fmt: skip
 def test_a_server_that_falls_silent_is_noticed_and_the_operator_says_when(query: str, own: dict[str, str]) -> None:
-    pytest.importorskip("psycopg")
     asked: list[dict[str, Any]] = []
 
     def note(_dialect: Any, _record: Any, _arguments: Any, parameters: dict[str, Any]) -> None:

@@ -208,18 +208,18 @@ class Supervisor:
             self._wake.clear()
 
     def _look(self) -> None:
+        was_over = self._end.is_set()
         self._settle()
         for pid in [pid for pid, child in self._children.items() if child.poll() is not None]:
             del self._children[pid]
         for job in self._queue.jobs("running"):
-            if self._end.is_set():
-                # The database was silent for long: another service may have it by now.
-                return
+            if self._end.is_set() != was_over:
+                return  # the database was silent for long: another service may have it by now
             with self._apart(job.sweep):
                 self._look_at(job)
         # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
         free = {name for name in {job.sweep for job in self._queue.jobs("waiting")} if self._may_run(name)}
-        while not (self._draining.is_set() or self._end.is_set()):
+        while self._end.is_set() == was_over and not self._draining.is_set():
             claimed = self._queue.claim(self._where.num_cpus, free.__contains__)
             if claimed is None:
                 break

@@ -7,6 +7,8 @@ import shutil
 import threading
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import cast
+from weakref import WeakMethod
 
 from analysis.records import CheckpointRecord
 from tune_jobs.store import names
@@ -22,14 +24,18 @@ class CopyObjects:
     Args:
         bucket: The sweep's objects.
         trial: What the keys of the trial's objects begin with.
-        folder: Returns the local folder of the trial, in one of this process.
+        folder: Returns the local folder of the trial, in one of this process; it is of an object that has this one.
     """
 
-    def __init__(self, bucket: Bucket, trial: str, folder: Callable[[], Path]) -> None:
-        self._bucket, self._prefix, self._folder = bucket, f"{trial}/{names.COPIES_FOLDER}", folder
+    def __init__(self, bucket: Bucket, trial: str, folder: WeakMethod[Callable[[], Path]]) -> None:
+        self._bucket, self._prefix, self._folder_of = bucket, f"{trial}/{names.COPIES_FOLDER}", folder
         self._lock = threading.Lock()
         self.noted: list[int] | None = None
         """Which to keep when the others are removed with the next head; None: nothing is to be removed."""
+
+    def _folder(self) -> Path:
+        # Weakly, or both would be kept, with their files, until garbage is collected.
+        return cast("Callable[[], Path]", self._folder_of())()
 
     def prefix_of(self, iteration: int) -> str:
         """Return what the keys of a copy's objects begin with."""

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from weakref import WeakMethod
 
 from policies.errors import CannotRunError, CheckpointError
 from tune_jobs.store import names
@@ -67,7 +68,7 @@ class TrialState:
         self._results: tuple[Chunk, ...] = ()
         self._has_results = False
         self._stored = CheckpointObjects(self._bucket, self._prefix)
-        self.copies = CopyObjects(self._bucket, self._prefix, self.folder)
+        self.copies = CopyObjects(self._bucket, self._prefix, WeakMethod(self.folder))
         self._lock = threading.RLock()
         # What the head and the local results are as of, while much is read.
         self._head_of: object | None = None
