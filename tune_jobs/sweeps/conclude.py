@@ -17,6 +17,7 @@ from policies.acting.policy import Policy, RandomPolicy
 from policies.envs.modules import allow_modules
 from policies.envs.wrappers import RESERVED
 from policies.errors import CheckpointError, EnvError, NotFoundError, SpecError, TuneJobsError
+from policies.files import expanded
 from policies.guard.guard import CALL_TIMEOUT_S, guarding
 from policies.guard.guarded import check_env, evaluate_policy, full_id, record_comparison, record_video
 from policies.hyperparams import ConstantHyperparams
@@ -34,7 +35,7 @@ from tune_jobs.sweeps.drive import cpus_for_episodes
 from tune_jobs.sweeps.policy_choice import choose_policy, episode_of, with_runners_up
 from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.sources import find_sweep, names_baseline
-from tune_jobs.sweeps.storage import expanded, split_trial
+from tune_jobs.sweeps.storage import split_trial
 from tune_jobs.training.registry import engine_of_checkpoint
 
 # The first seed of `evaluate` if no sweep gives one; it is never one of training, evaluation or confirmation.

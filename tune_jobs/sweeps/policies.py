@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 from analysis.best_records import BestRecord, EvaluationRecord
 from policies.arguments import NumEpisodes, Seed, checked
 from policies.envs.modules import allowed_again
+from policies.files import expanded
 from policies.guard.guard import guarding
 from tune_jobs.sweeps.outcome import Progress
 from tune_jobs.sweeps.results import Films
-from tune_jobs.sweeps.storage import expanded, local_path
+from tune_jobs.sweeps.storage import local_path
 
 if TYPE_CHECKING:
     from ray.rllib.algorithms.algorithm import Algorithm

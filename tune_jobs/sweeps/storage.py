@@ -9,8 +9,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl, quote, urlencode
 
 from policies.errors import SpecError
-from policies.files import absolute
-from policies.files import expanded as expanded  # noqa: PLC0414 (for those who know it by this module)
+from policies.files import absolute, expanded
 from tune_jobs.spec.sweep_spec import check_sweep_name, name_after
 from tune_jobs.store.command_names import DEFAULT_STORAGE
 from tune_jobs.store.contract import Sweep
