@@ -29,7 +29,15 @@ install: $(VENV)/installed
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "tune-jobs needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=python3.11"; exit 5; }
-	$(PYTHON) -m venv $(VENV)
+	@base=$$($(PYTHON) -c 'import os, sys; print(os.path.realpath(sys.executable))') && rm -f $(BIN)/python* && \
+		"$$base" -m venv $(VENV)
+
+# One without pip was made by half, as where Debian's python3-venv is missing, or by uv; or its Python is gone, or another
+# by now. Make takes nothing in it as done then: its links to Python are made anew, of what $(PYTHON) comes from, as that
+# may be one of them; and packages that fit stay.
+ifneq ($(shell $(BIN)/python -c 'import pip; print("sound")' 2> /dev/null),sound)
+.PHONY: $(VENV)/bin/python $(addprefix $(VENV)/installed,-bench -docs -test) $(VENV)/installed
+endif
 
 # Editable, so that an edit acts at once; the wheel is tested on its own. pip compiles what it installs, one file after
 # the other, which takes longer than the rest of its work: all cores do it at the end, but for files that aren't Python,

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import Field
 
 from analysis.notebook import facts_html
-from analysis.records import FORMAT_VERSION, CheckpointRecord, Cost, Count, Number, Objective, Record, TrialId
+from analysis.records import SEALED_FORMAT_VERSION, CheckpointRecord, Cost, Count, Number, Objective, Record, TrialId
 
 
 class EvaluationRecord(Record):
@@ -175,7 +175,7 @@ class ChoiceRecord(Record):
 class BestRecord(Record):
     """Both answers of a sweep, the policy to deploy and the setting to train with: best/evaluation.json."""
 
-    format_version: int = FORMAT_VERSION
+    format_version: int = SEALED_FORMAT_VERSION
     checkpoint: CheckpointRecord
     point: dict[str, Any]
     seed: int
@@ -217,5 +217,5 @@ class BestRecord(Record):
 class FilmsRecord(Record):
     """Whose films lie in best/: films.json, written once they are whole."""
 
-    format_version: int = FORMAT_VERSION
+    format_version: int = SEALED_FORMAT_VERSION
     checkpoint: CheckpointRecord = Field(description="The winner that they show.")

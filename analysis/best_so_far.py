@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from analysis.records import IterationRecord, TrialRecord, finite_or_none
 
@@ -53,23 +56,28 @@ def best_so_far(
     """
     trials = sorted(trials, key=lambda trial: trial.index)
     is_timed = all(is_moment(trial.started_at) for trial in trials)
-    moments = []
-    for trial in trials:
+    # A number each of all iterations, of which there may be millions: as objects they would take gigabytes.
+    moments, values = array("d"), array("d")
+    places, iterations, own, added = (array("q") for _ in range(4))
+    for place, trial in enumerate(trials):
         began = trial.started_at - _earlier_s(trial) if is_timed and trial.started_at is not None else 0.0
         steps = 0
         for item in results.get(trial.trial_id, ()):
-            moment = began + item.time_s if is_timed and math.isfinite(item.time_s) else began
-            moments.append(((moment, trial.index, item.iteration), max(0, item.num_env_steps - steps), trial, item))
+            moments.append(began + item.time_s if is_timed and math.isfinite(item.time_s) else began)
+            places.append(place)
+            iterations.append(item.iteration)
+            own.append(item.num_env_steps)
+            added.append(max(0, item.num_env_steps - steps))
+            value = finite_or_none(item.evaluation_return if evaluated else item.training_return)
+            values.append(-math.inf if value is None else value)
             steps = max(steps, item.num_env_steps)
-    moments.sort(key=lambda moment: moment[0])
     spent, best = 0, -math.inf
     found: list[Improvement] = []
-    for _, steps, trial, item in moments:
-        spent += steps
-        value = finite_or_none(item.evaluation_return if evaluated else item.training_return)
-        if value is not None and value > best:
-            best = value
-            found.append(Improvement(spent, value, trial.trial_id, item.num_env_steps))
+    for index in np.lexsort([np.asarray(key) for key in (iterations, places, moments)]).tolist():
+        spent += added[index]
+        if values[index] > best:
+            best = values[index]
+            found.append(Improvement(spent, best, trials[places[index]].trial_id, own[index]))
     return BestSoFar(tuple(found), spent, is_timed)
 
 

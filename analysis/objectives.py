@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.records import IterationRecord, Objective, TrialRecord, TrialState, length_of
+from analysis.records import IterationRecord, Objective, TrialRecord, TrialState, whole_length
 from analysis.statistics import area_under_curve, moderated_means
 from analysis.statistics.estimate import exponent_of
 
@@ -63,6 +63,7 @@ def rank_settings(
     objective: Objective = "final",
     *,
     num_env_steps: int,
+    num_iterations: int | None = None,
     threshold: float | None = None,
     worst: float | None = None,
 ) -> list[SettingScores]:
@@ -78,7 +79,8 @@ def rank_settings(
         trials: The trials of one sweep.
         results: Iterations by trial id, oldest first.
         objective: What a trial is judged by.
-        num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
+        num_env_steps: The env steps that a trial has at most, `stop.num_env_steps`.
+        num_iterations: The iterations that it has at most, `stop.num_iterations`; None: any number.
         threshold: The return to reach, for `steps_to_threshold`.
         worst: What a failed trial counts as, where other sweeps are looked at too; None: what this one says.
 
@@ -91,7 +93,10 @@ def rank_settings(
             shown[trial.trial_id] = None
         elif trial.status in ("completed", "stopped"):
             items = results.get(trial.trial_id, ())
-            shown[trial.trial_id] = score_of(trial, items, objective, num_env_steps=num_env_steps, threshold=threshold)
+            shown[trial.trial_id] = score_of(
+                trial, items, objective, num_env_steps=num_env_steps, num_iterations=num_iterations,
+                threshold=threshold,
+            )  # fmt: skip
     known = {trial_id: score for trial_id, score in shown.items() if score is not None}
     if not known:
         return []
@@ -111,7 +116,7 @@ def rank_settings(
             trial_ids=tuple(seed.trial_id for seed in seeds),
             num_failed=sum(seed.status == "failed" for seed in seeds),
             expected=value,
-            env_steps=tuple(env_steps_of(seed, num_env_steps) for seed in seeds),
+            env_steps=tuple(env_steps_of(seed, num_env_steps, num_iterations) for seed in seeds),
             num_unscored=sum(seed.trial_id not in known for seed in seeds),
         )
         for (index, seeds), value in zip(members.items(), expected, strict=True)
@@ -148,7 +153,7 @@ def reached_goal(trial: TrialState) -> bool:
     return (trial.stop_reason or "").startswith(_GOALS)
 
 
-def env_steps_of(trial: TrialRecord, num_env_steps: int) -> int:
+def env_steps_of(trial: TrialRecord, num_env_steps: int, num_iterations: int | None = None) -> int:
     """Return what a training as this trial's takes, in env steps, which is its cost.
 
     One that ended by itself took what it takes, less where it reached its goal early. One that a scheduler ended, or
@@ -158,10 +163,12 @@ def env_steps_of(trial: TrialRecord, num_env_steps: int) -> int:
     Args:
         trial: A trial that has ended.
         num_env_steps: The env steps that a trial of the sweep has at most.
+        num_iterations: The iterations that it has at most, `stop.num_iterations`; None: any number.
     """
     if trial.status == "completed":
         return trial.num_env_steps
-    return max(trial.num_env_steps, length_of(trial.point, num_env_steps))
+    length = whole_length(trial.point, trial.hyperparams, num_env_steps=num_env_steps, num_iterations=num_iterations)
+    return max(trial.num_env_steps, length)
 
 
 def score_of(
@@ -170,25 +177,30 @@ def score_of(
     objective: Objective,
     *,
     num_env_steps: int,
+    num_iterations: int | None = None,
     threshold: float | None = None,
 ) -> float | None:
     """Return what a trial scored, see `trial_score`, over the env steps that it was to have.
 
     Those are its own where it ended by a number of episodes or iterations, or by time: it trained as long as it was to.
-    One that reached its goal, or that a scheduler ended, was to have `num_env_steps`, or less where its point says so.
+    One that reached its goal, or that a scheduler ended, was to have `num_env_steps`, or less where its point or
+    `num_iterations` says so.
 
     Args:
         trial: The trial.
         iterations: Its iterations, oldest first.
         objective: What it is judged by.
         num_env_steps: The env steps that a trial has at most.
+        num_iterations: The iterations that it has at most, `stop.num_iterations`; None: any number.
         threshold: The return to reach, for `steps_to_threshold`.
 
     Raises:
         ValueError: `steps_to_threshold` without a threshold.
     """
     if objective != "steps_to_threshold":
-        num_env_steps = length_of(trial.point, num_env_steps)
+        num_env_steps = whole_length(
+            trial.point, trial.hyperparams, num_env_steps=num_env_steps, num_iterations=num_iterations
+        )
     return score_so_far(trial, iterations, objective, num_env_steps=num_env_steps, threshold=threshold)
 
 

@@ -19,7 +19,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_fie
 from analysis.notebook import Brief
 from analysis.waits import WaitRecord
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+"""The newest format of a sweep's files, which sweep.json has: 0.1.0 would write it again without what it lacked."""
+SEALED_FORMAT_VERSION = 2
+"""The format of files that are written with a seal, which are as 0.1.0 had them."""
 
 Objective = Literal["final", "area", "best", "steps_to_threshold"]
 """What a setting is judged by; see `analysis.objectives`."""
@@ -52,6 +55,27 @@ def length_of(point: Mapping[str, Any], num_env_steps: int) -> int:
     return num_env_steps
 
 
+def whole_length(
+    point: Mapping[str, Any],
+    hyperparams: Mapping[str, Any],
+    *,
+    num_env_steps: int,
+    num_iterations: int | None = None,
+) -> int:
+    """Return the env steps that a trial is to have, as far as is known before; its last iteration may go beyond.
+
+    Args:
+        point: Its searched values, of which one may be its length.
+        hyperparams: All of its hyperparameters, which say how long an iteration is.
+        num_env_steps: The env steps that a trial of the sweep has at most.
+        num_iterations: The iterations that it has at most; None: any number.
+    """
+    length = length_of(point, num_env_steps)
+    iteration = hyperparams.get("env_steps_per_iteration", hyperparams.get("train_batch_size"))
+    # A record of another version may say nothing of it.
+    return length if num_iterations is None or type(iteration) is not int else min(length, num_iterations * iteration)
+
+
 def finite_or_none(value: float | None) -> float | None:
     """Return the value, or None if it is None, NaN or infinite."""
     return None if value is None or not math.isfinite(value) else float(value)
@@ -78,6 +102,19 @@ class Record(BaseModel):
             field = fields.get(name or "")
             if field is None or field.is_required() or value != field.get_default(call_default_factory=True):
                 yield name, Brief(value)
+
+
+class RewrittenRecord(Record):  # noqa: PLW1641 (frozen, so pydantic makes its hash)
+    """A record whose file is written again while a sweep goes on, maybe by an older version than wrote it before.
+
+    What a newer version added stays in the file, and nothing else is done with it: records that differ in it alone are
+    equal.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self.__dict__ == other.__dict__
 
 
 class CheckpointRecord(Record):
@@ -195,7 +232,7 @@ class TrialState(Record):
         return finite_or_none(value)
 
 
-class TrialRecord(TrialState, TrialPlan):
+class TrialRecord(TrialState, TrialPlan, RewrittenRecord):
     """One training run: trial.json. The fields of a plan come first there, then those of the state."""
 
     def point_at(self, iteration: int) -> dict[str, Any]:
@@ -265,7 +302,7 @@ class JobRecord(Record):
     place: str = Field("", description="The folder or URL of the sweep that it is of; empty in older records.")
 
 
-class SweepRecord(Record):
+class SweepRecord(RewrittenRecord):
     """The record of a sweep: sweep.json."""
 
     format_version: int = FORMAT_VERSION
@@ -299,6 +336,12 @@ class SweepRecord(Record):
     is_masked: bool = Field(
         default=False, description="Whether the env says which actions are allowed; False in older records."
     )
+
+    @property
+    def max_iterations(self) -> int | None:
+        """The iterations that a trial has at most, `stop.num_iterations`; None: the record doesn't say."""
+        stated = self.section("stop").get("num_iterations")
+        return stated if isinstance(stated, int) else None
 
     @property
     def is_population(self) -> bool:

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from analysis import report_data, wording
 from analysis.best_records import BestRecord, SettingsRecord
+from analysis.compact import lean
+from analysis.iterations_csv import write_iterations
 from analysis.page import all_trials, answer, cards, charts, cost, front, head, how_sure, mattered, next_steps, repeat
 from analysis.page.bounded import bounded
 from analysis.page.figures import draw_figures
@@ -26,7 +28,7 @@ from analysis.page.source import Source
 from analysis.page_templates import make_environment, template_file
 from analysis.plot_style import CSS_DARK, CSS_LIGHT
 from analysis.records import IterationRecord, SweepRecord, TrialRecord
-from analysis.tables import iterations_frame, steps_to_solve_frame, trials_frame, write_csv
+from analysis.tables import steps_to_solve_frame, trials_frame, write_csv
 from policies.files import write_atomic
 
 if TYPE_CHECKING:
@@ -73,11 +75,11 @@ def build_report(
     """
     goal = report_data.goal_of(sweep, best)
     write_csv(target / "trials.csv", trials_frame(trials, results, threshold=goal))
-    write_csv(target / "iterations.csv", iterations_frame(results))
+    write_iterations(target / "iterations.csv", results)
     write_csv(target / "steps_to_solve.csv", steps_to_solve_frame(trials, results, threshold=goal))
     if settings is None and best is not None:
         settings = best.settings
-    results = bounded(results)
+    results = bounded(lean(results))
     source = Source(place, sweep, trials, results, best, goal, why_no_best, settings)
     page = _render(
         source=source,

@@ -26,6 +26,7 @@ def judge_settings(
     objective: Objective = "final",
     *,
     num_env_steps: int,
+    num_iterations: int | None = None,
     threshold: float | None,
     cost: Cost | None = None,
 ) -> SettingsRecord | None:
@@ -38,14 +39,17 @@ def judge_settings(
         trials: The trials of one sweep.
         results: Iterations by trial id, oldest first.
         objective: What they are judged by.
-        num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
+        num_env_steps: The env steps that a trial has at most, `stop.num_env_steps`.
+        num_iterations: The iterations that it has at most, `stop.num_iterations`; None: any number.
         threshold: The return that solves the env; None: it has none.
         cost: What settings cost; None: the sweep doesn't ask for it.
 
     Raises:
         ValueError: In the cases of `objectives.rank_settings`.
     """
-    ranking = rank_settings(trials, results, objective, num_env_steps=num_env_steps, threshold=threshold)
+    ranking = rank_settings(
+        trials, results, objective, num_env_steps=num_env_steps, num_iterations=num_iterations, threshold=threshold
+    )
     if not ranking:
         return None
     known = _known(ranking)

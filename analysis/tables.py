@@ -46,6 +46,9 @@ _AFTER_POINT = [
     "error",
 ]
 
+OF_ITERATIONS = ("iteration", "num_env_steps", "num_episodes", "time_s", "training_return", "evaluation_return")
+"""The numbers of an iteration that are columns, besides those that the learner measured."""
+
 
 def cell_value(value: Any) -> Any:
     """Return a sampled value as a table cell: hidden sizes `[64, 64]` as "64x64", other containers as text.
@@ -249,19 +252,18 @@ def iterations_frame(results: Mapping[str, Sequence[IterationRecord]]) -> pd.Dat
     """Return a table with one row per iteration: trial_id, its numbers, and `learner/<name>` for each metric."""
     import pandas as pd
 
-    base = ["iteration", "num_env_steps", "num_episodes", "time_s", "training_return", "evaluation_return"]
     learner = sorted({name for items in results.values() for item in items for name in item.learner})
     rows = [
         {
             "trial_id": trial_id,
-            **{name: getattr(item, name) for name in base},
+            **{name: getattr(item, name) for name in OF_ITERATIONS},
             **{f"learner/{name}": value for name, value in item.learner.items()},
         }
         for trial_id, items in results.items()
         for item in items
     ]
     metrics = [f"learner/{name}" for name in learner]
-    frame = pd.DataFrame(rows, columns=["trial_id", *base, *metrics])
+    frame = pd.DataFrame(rows, columns=["trial_id", *OF_ITERATIONS, *metrics])
     floats = ["time_s", "training_return", "evaluation_return", *metrics]
     return frame.astype(dict.fromkeys(floats, "float64"))
 
@@ -339,6 +341,8 @@ def steps_to_solve_frame(
         points.setdefault(trial.point_index, []).append(trial)
     rows = []
     for index, members in sorted(points.items()):
+        # Seeds of one point have the same values; a population, whose trials change theirs, has one seed a point.
+        point = solving_point(members[0], threshold, results.get(members[0].trial_id, ()))
         steps = {
             trial.seed_index: _env_steps_to_solve(trial, threshold, results.get(trial.trial_id, ()))
             for trial in members
@@ -346,8 +350,6 @@ def steps_to_solve_frame(
         # A seed that still runs may yet solve it.
         known = [steps[t.seed_index] for t in members if t.status in FINISHED or steps[t.seed_index] is not None]
         solved = [value for value in known if value is not None]
-        # Seeds of one point have the same values; a population, whose trials change theirs, has one seed a point.
-        point = solving_point(members[0], threshold, results.get(members[0].trial_id, ()))
         rows.append(
             {
                 "point_index": index,

@@ -136,6 +136,9 @@ MALFORMED = (
 )  # fmt: skip
 """The exceptions that unexpected data raises; code that reads a file turns them into a `CheckpointError`."""
 
+UPGRADE = "Upgrade tune-jobs: install it again from its repository, after `git pull` there, or from a newer wheel."
+"""What to do about what a newer version wrote. By its name alone pip would look for it in an index, which has none."""
+
 
 class ObservationError(TuneJobsError):
     """An observation does not have the shape that the policy takes."""

@@ -123,6 +123,20 @@ def expanded(path: str | Path) -> Path:
         return Path(path)
 
 
+def is_output_folder(path: Path) -> bool:
+    """Whether a path to write to is a folder that is there already.
+
+    Raises:
+        CannotRunError: This cannot be found out, so that nothing can be written there either.
+    """
+    try:
+        return stat.S_ISDIR(path.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+
+
 def write_atomic(path: Path, data: bytes | str) -> None:
     """Write a file so that its name always holds either the old content or all of the new.
 

@@ -118,6 +118,10 @@ class ReplayBuffer:
         """Return the number of transitions."""
         return self._size
 
+    def expect(self, num_transitions: int) -> None:
+        """Take no more room than for so many transitions, as more will never come; told before the first are added."""
+        self.capacity = min(self.capacity, num_transitions)
+
     def add(self, transitions: Transitions) -> NDArray[np.int64]:
         """Append transitions, shape (B, ...); if more are given than fit, the newest stay.
 

@@ -90,6 +90,11 @@ class Subject:
         return stated if isinstance(stated, int) else max((trial.num_env_steps for trial in self.trials), default=0)
 
     @property
+    def _num_iterations(self) -> int | None:
+        # How long an iteration is may change in a population, as its trials' values do.
+        return None if self.is_population else self.sweep.max_iterations
+
+    @property
     def score_name(self) -> str:
         """What scores are, as the name of an axis."""
         return _SCORES[self.objective]
@@ -103,7 +108,10 @@ class Subject:
         if trial.status == "failed":
             return None
         items = self.results.get(trial.trial_id, ())
-        score = score_of(trial, items, self.objective, num_env_steps=self._num_env_steps, threshold=self._threshold)
+        score = score_of(
+            trial, items, self.objective, num_env_steps=self._num_env_steps, num_iterations=self._num_iterations,
+            threshold=self._threshold,
+        )  # fmt: skip
         return score if score is not None and math.isfinite(score) else None
 
     @cached_property
@@ -113,8 +121,9 @@ class Subject:
         if self.is_population:
             trials = [trial.model_copy(update={"point_index": trial.index, "seed_index": 0}) for trial in trials]
         return rank_settings(
-            trials, self.results, self.objective, num_env_steps=self._num_env_steps, threshold=self._threshold
-        )
+            trials, self.results, self.objective, num_env_steps=self._num_env_steps,
+            num_iterations=self._num_iterations, threshold=self._threshold,
+        )  # fmt: skip
 
     def ending(self, trial: TrialRecord) -> Ending:
         """Return how a trial ended."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,7 @@ def first_difference(
             there, and the repetition ended by itself.
     """
     by_number = {item.iteration: item for item in repeated}
+    learned = _learned_in_both(recorded, repeated)
     for item in recorded:
         other = by_number.get(item.iteration)
         if other is None:
@@ -110,7 +111,7 @@ def first_difference(
         changed = [Changed(name, *_shown(getattr(item, name), getattr(other, name))) for name in names]
         changed += [
             Changed(f"learner/{name}", *_shown(item.learner.get(name), other.learner.get(name)))
-            for name in sorted({*item.learner, *other.learner})
+            for name in sorted(learned)
             if not _same(item.learner.get(name), other.learner.get(name))
         ]
         if changed:
@@ -130,17 +131,25 @@ def same_numbers(
     """
     by_number = {item.iteration: item for item in other}
     both = [(item, by_number[item.iteration]) for item in one if item.iteration in by_number]
-    return bool(both) and all(_are_same(*pair, are_evaluated_alike=are_evaluated_alike) for pair in both)
+    learned = _learned_in_both(one, other)
+    return bool(both) and all(_are_same(*pair, learned, are_evaluated_alike=are_evaluated_alike) for pair in both)
 
 
-def _are_same(one: IterationRecord, other: IterationRecord, *, are_evaluated_alike: bool) -> bool:
+def _learned_in_both(one: Sequence[IterationRecord], other: Sequence[IterationRecord]) -> set[str]:
+    """Return the names of the learner's numbers in two trainings; one version may have some that another lacks."""
+    ours, theirs = ({name for item in training for name in item.learner} for training in (one, other))
+    return ours & theirs
+
+
+def _are_same(
+    one: IterationRecord, other: IterationRecord, learned: Collection[str], *, are_evaluated_alike: bool
+) -> bool:
     names = [name for name in _COMPARED if name != "evaluation_return"]
     # One of them may be evaluated less often.
     if are_evaluated_alike and None not in (one.evaluation_return, other.evaluation_return):
         names.append("evaluation_return")
-    learned = ((one.learner.get(name), other.learner.get(name)) for name in {*one.learner, *other.learner})
     return all(_same(getattr(one, name), getattr(other, name)) for name in names) and all(
-        _same(*values) for values in learned
+        _same(one.learner.get(name), other.learner.get(name)) for name in learned
     )
 
 

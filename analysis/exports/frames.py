@@ -43,13 +43,15 @@ class SweepData:
     objective: Objective
     """What settings are judged by."""
     num_env_steps: int
-    """The env steps that a trial has, `stop.num_env_steps`."""
+    """The env steps that a trial has at most, `stop.num_env_steps`."""
     threshold: float | None
     """The return that solves the env; None: nothing is said of solving."""
     failed_score: float | None = None
     """What a training that failed counts as, where other sweeps are looked at too; None: see `objectives`."""
     has_settings: bool = True
     """False of a population, whose trials change their values while they train."""
+    num_iterations: int | None = None
+    """The iterations that a trial has at most, `stop.num_iterations`; None: any number."""
 
 
 def make_frame(data: SweepData, rows: Rows) -> pd.DataFrame:
@@ -79,6 +81,7 @@ def _objective_score(trial: TrialRecord, data: SweepData) -> float | None:
         data.results.get(trial.trial_id, ()),
         data.objective,
         num_env_steps=data.num_env_steps,
+        num_iterations=data.num_iterations,
         threshold=data.threshold,
     )
 
@@ -175,8 +178,8 @@ def ranked_settings(data: SweepData) -> list[SettingScores]:
     if not data.has_settings or (data.objective == "steps_to_threshold" and data.threshold is None):
         return []
     return rank_settings(
-        data.trials, data.results, data.objective, num_env_steps=data.num_env_steps, threshold=data.threshold,
-        worst=data.failed_score,
+        data.trials, data.results, data.objective, num_env_steps=data.num_env_steps,
+        num_iterations=data.num_iterations, threshold=data.threshold, worst=data.failed_score,
     )  # fmt: skip
 
 

@@ -53,23 +53,19 @@ def score_points(
         return Scored(objective, (), (), 0, why_none)
     first_cut = min((trial.num_env_steps for trial in ended if trial.status == "stopped"), default=None)
     whole = int(sweep.section("stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
-    shown = {trial.trial_id: results.get(trial.trial_id, ()) for trial in ended if trial.status != "failed"}
-    ever: set[str] = set()
-    num_unevaluated = 0
-    if first_cut is not None:
-        ever = {trial_id for trial_id, rows in shown.items() if is_evaluated(rows)}
-        shown = {trial_id: rows_until(rows, first_cut) for trial_id, rows in shown.items()}
-        num_unevaluated = sum(not is_evaluated(shown[trial_id]) for trial_id in ever)
-        if num_unevaluated:
-            objective = "final"
-            shown = {trial_id: training_alone(rows, first_cut // 2) for trial_id, rows in shown.items()}
+    shown = [trial for trial in ended if trial.status != "failed"]
+    ever, num_unevaluated = (set[str](), 0) if first_cut is None else _evaluated(shown, results, first_cut)
+    if num_unevaluated:
+        objective = "final"
     found = {
         trial.trial_id: finite_or_none(
-            score_of(trial, shown[trial.trial_id], objective, num_env_steps=first_cut or whole, threshold=goal)
+            score_of(
+                trial, _judged(results.get(trial.trial_id, ()), first_cut, alone=num_unevaluated > 0), objective,
+                num_env_steps=first_cut or whole, num_iterations=sweep.max_iterations, threshold=goal,
+            )
         )
-        for trial in ended
-        if trial.trial_id in shown
-    }
+        for trial in shown
+    }  # fmt: skip
     # They showed something, but later.
     left_out = {trial_id for trial_id in ever if found[trial_id] is None}
     known = [score for score in found.values() if score is not None]
@@ -98,6 +94,28 @@ def score_points(
         notes=tuple(notes),
         num_env_steps=first_cut,
     )
+
+
+def _evaluated(
+    shown: Sequence[TrialRecord], results: Mapping[str, Sequence[IterationRecord]], first_cut: int
+) -> tuple[set[str], int]:
+    """Return the trials that were ever evaluated, and how many of them were not by the first cut."""
+    ever: set[str] = set()
+    num_unevaluated = 0
+    for trial in shown:
+        rows = results.get(trial.trial_id, ())
+        if is_evaluated(rows):
+            ever.add(trial.trial_id)
+            num_unevaluated += not is_evaluated(rows_until(rows, first_cut))
+    return ever, num_unevaluated
+
+
+def _judged(rows: Sequence[IterationRecord], first_cut: int | None, *, alone: bool) -> Sequence[IterationRecord]:
+    """Return the iterations that a trial is judged by: up to the first cut, if any, maybe with training `alone`."""
+    if first_cut is None:
+        return rows
+    until = rows_until(rows, first_cut)
+    return training_alone(until, first_cut // 2) if alone else until
 
 
 def _notes_of_worst(*, num_failed: int, num_lost: int) -> Iterator[str]:

@@ -5,18 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from analysis.compact import CompactResults
 from analysis.plot_style import MAX_DRAWN
 from analysis.records import IterationRecord
 
 
 def bounded(results: Mapping[str, Sequence[IterationRecord]]) -> Mapping[str, Sequence[IterationRecord]]:
     """Return iterations whose returns are at most 1e100 in size, so that their sums are finite, too."""
-    return {trial_id: [_bounded(item) for item in items] for trial_id, items in results.items()}
+    if all(_is_bounded(item) for items in results.values() for item in items):
+        return results
+    return CompactResults((trial_id, map(_bounded, items)) for trial_id, items in results.items()).lean()
+
+
+def _is_bounded(item: IterationRecord) -> bool:
+    returns = (item.training_return or 0.0, item.evaluation_return or 0.0)
+    return all(abs(value) <= MAX_DRAWN for value in (*returns, *item.episode_returns) if not math.isnan(value))
 
 
 def _bounded(item: IterationRecord) -> IterationRecord:
-    returns = (item.training_return or 0.0, item.evaluation_return or 0.0)
-    if all(abs(value) <= MAX_DRAWN for value in (*returns, *item.episode_returns) if not math.isnan(value)):
+    if _is_bounded(item):
         return item
     return item.model_copy(
         update={

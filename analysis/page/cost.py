@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from analysis.core_seconds import busy_cores, busy_seconds
 from analysis.objectives import reached_goal
 from analysis.page.source import Source
-from analysis.records import TrialRecord, length_of
+from analysis.records import TrialRecord, whole_length
 from analysis.report_data import run_time_of
 from analysis.wording import counted, duration, number
 
@@ -77,7 +77,11 @@ def _saved(source: Source) -> str:
     ended = [trial for trial in source.trials if trial.status in ("completed", "stopped")]
     if not isinstance(cap, int) or not ended:
         return ""
-    caps = {trial.trial_id: length_of(trial.point, cap) for trial in ended}
+    most = source.sweep.max_iterations
+    caps = {
+        trial.trial_id: whole_length(trial.point, trial.hyperparams, num_env_steps=cap, num_iterations=most)
+        for trial in ended
+    }
     whole = sum(max(caps[trial.trial_id], trial.num_env_steps) for trial in ended)
     length = f"{cap:,} env steps" if set(caps.values()) == {cap} else "the env steps that they were to have"
     by_scheduler = [trial for trial in ended if trial.status == "stopped"]

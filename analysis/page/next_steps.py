@@ -11,7 +11,7 @@ from analysis.best_records import SettingRecord
 from analysis.page.estimates import replicate_takes, takes
 from analysis.page.narrowed import narrowed_space
 from analysis.page.source import Source, point_text
-from analysis.records import TRAINING_LENGTH, length_of
+from analysis.records import TRAINING_LENGTH, whole_length
 from analysis.wording import counted
 
 if TYPE_CHECKING:
@@ -134,7 +134,10 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
     env = env if isinstance(env, Mapping) else {"id": str(env)}
     env_id, env_args = str(env.get("id", "?")), dict(env.get("args") or {})
     cap = source.sweep.section("stop").get("num_env_steps")
-    cap = length_of(best.point, cap) if isinstance(cap, int) else 100_000
+    most = source.sweep.max_iterations
+    length = 100_000
+    if isinstance(cap, int):
+        length = whole_length(best.point, values.model_dump(), num_env_steps=cap, num_iterations=most)
     is_masked = source.sweep.is_masked
     names = ("frame_stack", "pixels", "atari", "action_mask", "own_process", "failure_penalty")
     changed = [
@@ -157,7 +160,7 @@ def _foreign(source: Source, best: SettingRecord) -> Iterator[Step]:
                 values,
                 env_id=env_id,
                 env_args=env_args,
-                num_env_steps=cap,
+                num_env_steps=length,
                 flattens=flattens,
                 may_be_continuous=not is_masked,
             ),

@@ -92,7 +92,7 @@ class Source:
         return rank_settings(
             self.trials, self.results, settings.objective,
             num_env_steps=int(cap or max((trial.num_env_steps for trial in self.trials), default=0)),
-            threshold=settings.threshold,
+            num_iterations=self.sweep.max_iterations, threshold=settings.threshold,
         )  # fmt: skip
 
     def env_steps_to_goal(self, trial_id: str, goal: float | None) -> int | None:

@@ -11,7 +11,6 @@ Words: a *game* is one whole episode, with all its lives; a *frame* is one pictu
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
@@ -22,6 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import AtariPreprocessing, TimeLimit
 from numpy.typing import NDArray
 
+from policies.envs.signatures import named_parameters
 from policies.envs.training_view import TrainingView
 from policies.errors import EnvError
 
@@ -77,7 +77,7 @@ class AtariFrames:
                 the emulator's memory in place of its screen.
         """
         args = {name: value for name, value in env_args.items() if name != "max_episode_steps"}
-        takes = () if creator is None else inspect.signature(creator).parameters
+        takes = named_parameters(creator)
         if "frameskip" not in takes:
             raise _no_game(env_id)
         if args.setdefault("frameskip", 1) != 1:

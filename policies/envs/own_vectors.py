@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +13,7 @@ from policies.envs.atari import is_of_emulator
 from policies.envs.faults import close_env
 from policies.envs.flat import needs_flattening
 from policies.envs.own_actions import is_taken
+from policies.envs.signatures import signature
 
 
 def own_vector_env(
@@ -46,7 +46,7 @@ def takes_vector_entry_point(spec: EnvSpec, env_args: dict[str, Any]) -> bool:
     try:
         entry_point = spec.vector_entry_point
         creator = entry_point if callable(entry_point) else load_env_creator(entry_point)
-        inspect.signature(creator).bind(num_envs=1, **kwargs)
+        signature(creator).bind(num_envs=1, **kwargs)
     except (ImportError, AttributeError, TypeError, ValueError):
         return False
     return _resets_in_next_step(getattr(creator, "metadata", None))

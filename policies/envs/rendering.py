@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import math
 import os
 import re
@@ -18,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from policies.envs.signatures import signature
 from policies.errors import said_by
 
 _Made = TypeVar("_Made")
@@ -106,7 +106,7 @@ def without_window(
 
 def _defaults(creator: Callable[..., Any] | None) -> dict[str, Any]:
     """Return the defaults of the parameters of what makes an env."""
-    parameters = inspect.signature(creator).parameters if creator is not None else {}
+    parameters = signature(creator).parameters if creator is not None else {}
     return {name: parameter.default for name, parameter in parameters.items()}
 
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
+from pathlib import Path
 
 from policies.envs.calls import Call, Page
 from policies.errors import EnvFailedError
+
+_MAX_FRAMES = 8
+_PACKAGE = Path(__file__).parents[1]
+_C_STACK = "Current thread's C stack trace"
+"""What Python's fault handler writes after the frames of a crash, from Python 3.14 on."""
 
 
 def hung(env_id: str, where: str, limit_s: float, frames: Sequence[str]) -> EnvFailedError:
@@ -51,6 +57,22 @@ def place_of(page: Page) -> str:
     if call is Call.STEP and page.steps:
         return f"{call.phrase}, step {page.steps} after reset()"
     return call.phrase
+
+
+def frames_in(dump: str) -> list[str]:
+    """Return the frames of the user's code, innermost first, of what Python's fault handler wrote."""
+    frames: list[str] = []
+    # The main thread's frames come last, after those of other threads.
+    for line in dump.partition(_C_STACK)[0].rpartition("(most recent call first):")[2].splitlines():
+        place = line.strip()
+        if place.startswith(f'File "{_PACKAGE}'):
+            break
+        if place.startswith("File "):
+            frames.append(place)
+    if any("gymnasium" not in frame for frame in frames):
+        while "gymnasium" in frames[-1]:  # Gymnasium's wrappers, which the call came through
+            frames.pop()
+    return frames[:_MAX_FRAMES]
 
 
 def _shown(frames: Sequence[str]) -> str:

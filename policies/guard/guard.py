@@ -18,7 +18,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,14 +25,15 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from multiprocessing.connection import Pipe
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 from policies.child_processes import BEGINNING
-from policies.envs.calls import PAGE_BYTES, Call, Page
+from policies.envs.calls import Call, Page
 from policies.envs.modules import ENVIRONMENT_VARIABLE, allowed_modules, module_folders
 from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from policies.files import absolute
-from policies.guard.failures import died, hung, place_of
+from policies.guard.failures import died, frames_in, hung, place_of
+from policies.guard.shared_files import shared_files
 from policies.standard_streams import standard_streams
 
 CALL_TIMEOUT_S = 600.0
@@ -45,7 +45,6 @@ _LOOK_S = 0.5
 _PATIENCE_S = 5.0
 """How long the child may take to end by itself before it is killed."""
 _TRACEBACK_S = 1.0
-_MAX_FRAMES = 8
 _PACKAGE = Path(__file__).parents[1]
 _BOOTSTRAP = f"""{BEGINNING}\
 from policies.guard.child import main
@@ -89,10 +88,8 @@ class _Child:
             self._begin()
 
     def _begin(self) -> None:
+        self._page_file, self._dump = shared_files()
         self.connection, theirs = Pipe()
-        self._page_file: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (until `close`)
-        self._page_file.truncate(PAGE_BYTES)
-        self._dump: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         self.page = Page(self._page_file.fileno())
         numbers = (theirs.fileno(), self._page_file.fileno(), self._dump.fileno())
         code = _BOOTSTRAP.format(
@@ -134,19 +131,7 @@ class _Child:
     def frames(self) -> list[str]:
         """Return the frames of the user's code, innermost first, as Python's fault handler wrote them."""
         self._dump.seek(0)
-        said = self._dump.read().decode("utf-8", errors="replace")
-        frames: list[str] = []
-        # The main thread's frames come last, after those of other threads.
-        for line in said.rpartition("(most recent call first):")[2].splitlines():
-            place = line.strip()
-            if place.startswith(f'File "{_PACKAGE}'):
-                break
-            if place.startswith("File "):
-                frames.append(place)
-        if any("gymnasium" not in frame for frame in frames):
-            while "gymnasium" in frames[-1]:  # Gymnasium's wrappers, which the call came through
-                frames.pop()
-        return frames[:_MAX_FRAMES]
+        return frames_in(self._dump.read().decode("utf-8", errors="replace"))
 
     def dump_frames(self) -> None:
         """Let the fault handler write the child's frames, which works while its Python code hangs."""

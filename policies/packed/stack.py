@@ -51,8 +51,13 @@ class Stack(ABC, Generic[H, G, S]):
         self._num_inputs = self._seen.num_inputs
         """The numbers of an observation that networks see."""
 
-    def add(self, member: Member[H], env_seed: int) -> None:
+    def add(self, member: Member[H], env_seed: int, max_env_steps: int | None = None) -> None:
         """Add a member and begin its episodes.
+
+        Args:
+            member: The member.
+            env_seed: Seeds its environments.
+            max_env_steps: The most env steps that it will be trained here; None: not known.
 
         Raises:
             EnvError: Its environments cannot be made or reset; then it is not added.
@@ -64,7 +69,7 @@ class Stack(ABC, Generic[H, G, S]):
         self.envs.add(member.member_id, env_seed)
         self._write_back()
         try:
-            self._begin(member)
+            self._begin(member, max_env_steps)
         except MemoryError:
             self.envs.remove(member.member_id)
             raise
@@ -95,7 +100,7 @@ class Stack(ABC, Generic[H, G, S]):
             group.write_back()
         self._is_written = True
 
-    def _begin(self, member: Member[H]) -> None:
+    def _begin(self, member: Member[H], max_env_steps: int | None) -> None:
         """Make room for what the algorithm keeps for a member besides its weights.
 
         Raises:

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from policies.errors import MALFORMED, CheckpointError
+from policies.errors import MALFORMED, UPGRADE, CheckpointError
 from policies.files import write_plain
 from policies.hyperparams import Algorithm, Hyperparams, PPOHyperparams, TrainedHyperparams, make_hyperparams
 from policies.packed.member import OBS_COUNT, OBS_MEAN, OBS_VAR, TARGET_PREFIX, AnyMember, Member, Weights
@@ -79,7 +79,7 @@ def load_member(folder: Path, member_id: str) -> AnyMember:
             raise CheckpointError(
                 f"{folder / _JSON} has format version {str(description['format_version'])[:80]}; this tune-jobs reads "
                 f"up to {_FORMAT_VERSION}.",
-                "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
+                UPGRADE,
             )
         hyperparams = make_hyperparams(cast("Algorithm", description["algorithm"]), description["hyperparams"])
         rng = np.random.Generator(np.random.PCG64())

@@ -5,7 +5,8 @@ they form (see `policies.portable.network`), which environment it acts in and ho
 SHA-256 of the weights.
 
 Formats: version 1 had only layers; version 2 has all that `policies.portable.network` describes, and writes the bounds
-of a space as one number where they are all equal. Both can be read.
+of a space as one number where they are all equal. Both can be read. The space of observations says what of them is a
+mask of actions, null for nothing; where it does not say, the file is of a version that knew no masks.
 
 JSON has no infinity and no NaN. In the arguments of an environment and of a user's own network, which decide what is
 made, they are objects such as {"$float": "-Infinity"}, and are read back as what they were; files of older versions
@@ -17,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +26,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from policies.envs.mask_settings import ACTION_MASK
 from policies.envs.spaces import describe_space, space_from_description
 from policies.errors import MALFORMED, CheckpointError, NotFoundError
 from policies.files import read_regular, write_atomic
@@ -49,7 +52,7 @@ __all__ = [
 
 FORMAT_VERSION = 2
 READABLE_VERSIONS = (1, 2)
-_FLOAT = "$float"
+_FLOAT, _MASK = "$float", "mask"
 _NON_FINITE = {"Infinity": math.inf, "-Infinity": -math.inf, "NaN": math.nan}
 _MAX_CHARS = 400
 """The most characters of a problem that a message quotes."""
@@ -76,7 +79,7 @@ class PortablePolicy:
     @property
     def needs_mask(self) -> bool:
         """Whether it is told beside an observation which actions are allowed, as the observation does not tell."""
-        mask = self.observation_space.get("mask")
+        mask = self.observation_space.get(_MASK)
         return isinstance(mask, dict) and mask.get("key") is None
 
 
@@ -117,7 +120,7 @@ def save_policy(
         "algorithm": policy.algorithm,
         "env_id": policy.env_id,
         "env_args": _jsonable(policy.env_args, exact=True),
-        "observation_space": policy.observation_space,
+        "observation_space": {_MASK: None} | policy.observation_space,
         "action_space": policy.action_space,
         "action_transform": policy.action_transform,
         "network": network,
@@ -136,8 +139,12 @@ def policy_files(folder: Path) -> dict[str, Path]:
 
 
 def is_policy_folder(folder: Path) -> bool:
-    """Whether a folder holds a policy, judged by the name of its file; its content is not looked at."""
-    return (folder / "policy.json").is_file()
+    """Whether a folder holds a policy, judged by the name of its file; its content is not looked at.
+
+    Raises:
+        NotFoundError: This cannot be found out.
+    """
+    return stat.S_ISREG(_mode(folder / "policy.json"))
 
 
 def read_policy(path: Path) -> PortablePolicy:
@@ -147,7 +154,7 @@ def read_policy(path: Path) -> PortablePolicy:
         path: The JSON file, the safetensors file beside it, or a folder that holds `policy.json`.
 
     Raises:
-        NotFoundError: One of the two files is not there.
+        NotFoundError: One of the two files is not there, or cannot be read.
         CheckpointError: The files do not belong together, were altered, or have another format.
     """
     json_path, weights_path = _locate(Path(path))
@@ -157,9 +164,7 @@ def read_policy(path: Path) -> PortablePolicy:
     except (ValueError, RecursionError, MemoryError) as error:  # JSON and UTF-8 errors are both ValueErrors
         raise _broken(json_path, f"is not JSON: {error}") from error
     except OSError as error:
-        raise NotFoundError(
-            f"The policy file {json_path} cannot be read: {error.strerror}.", "Check its permissions."
-        ) from error
+        raise _unreadable(json_path, error) from error
     if not isinstance(description, dict) or "format_version" not in description:
         raise _broken(json_path, "is not a policy file: it has no format_version")
     version = description["format_version"]
@@ -182,10 +187,11 @@ def read_policy(path: Path) -> PortablePolicy:
 
 
 def _locate(path: Path) -> tuple[Path, Path]:
-    if path.is_dir():
+    mode = _mode(path)
+    if stat.S_ISDIR(mode):
         path = path / "policy.json"
     elif path.suffix not in {".json", ".safetensors"}:
-        if not path.exists():
+        if not mode:
             raise NotFoundError(f"There is no policy file {path}.", "Give a policy.json, or the folder that holds one.")
         raise CheckpointError(
             f"{path} is not a policy file: its name ends in neither .json nor .safetensors.",
@@ -193,12 +199,33 @@ def _locate(path: Path) -> tuple[Path, Path]:
         )
     pair = (path.with_suffix(".json"), path.with_suffix(".safetensors"))
     for file in pair:
-        if not file.is_file():
+        if not stat.S_ISREG(_mode(file)):
             raise NotFoundError(
                 f"There is no policy file {file}.",
                 "Give a policy.json with its .safetensors beside it, or the folder that holds both.",
             )
     return pair
+
+
+def _mode(path: Path) -> int:
+    """Return the mode of what is at a path; 0: there is nothing.
+
+    Raises:
+        NotFoundError: This cannot be found out. (`Path.is_file` would raise an error of the system, or answer False.)
+    """
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # a NUL is in it
+        return 0
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> NotFoundError:
+    return NotFoundError(
+        f"The policy file {path} cannot be read: {error.strerror}.",
+        "Check its permissions, and those of the folders above it.",
+    )
 
 
 def _broken(path: Path, what: str) -> CheckpointError:
@@ -221,8 +248,8 @@ def _assemble(description: dict[str, Any], weights: bytes, place: Path) -> Porta
             network=network,
             algorithm=str(description["algorithm"]),
             env_id=str(description["env_id"]),
-            env_args={key: _from_exact(value) for key, value in dict(description["env_args"]).items()},
-            observation_space=dict(description["observation_space"]),
+            env_args=_env_args(description),
+            observation_space=_observation_space(description),
             action_space=dict(description["action_space"]),
             action_transform=description["action_transform"],
             training=dict(description.get("training") or {}),
@@ -267,6 +294,27 @@ def _jsonable(value: Any, *, exact: bool = False) -> Any:
         sign = "-" if value < 0 else ""
         return {_FLOAT: "NaN" if math.isnan(value) else f"{sign}Infinity"} if exact else None
     return value if isinstance(value, (str, int, float, bool)) or value is None else str(value)
+
+
+def _env_args(description: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a policy's environment.
+
+    Raises:
+        KeyError, TypeError, ValueError: There are none.
+    """
+    env_args = {key: _from_exact(value) for key, value in dict(description["env_args"]).items()}
+    # Versions that knew no masks trained without the one that the environment may have.
+    return env_args if _MASK in description["observation_space"] else {ACTION_MASK: False} | env_args
+
+
+def _observation_space(description: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the description of a policy's observations, without a mask that there is none of.
+
+    Raises:
+        KeyError, TypeError, ValueError: There is no description.
+    """
+    space = dict(description["observation_space"])
+    return space if space.get(_MASK) is not None else {key: space[key] for key in space if key != _MASK}
 
 
 def _from_exact(value: Any) -> Any:

@@ -5,15 +5,18 @@ import re
 import sys
 import tomllib
 from collections.abc import Sequence
-from importlib.metadata import packages_distributions
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from packaging.requirements import Requirement
 
 from tests.narrowing import present
 
 OWN = {"policies", "analysis", "tune_jobs"}
+# What later versions of Python have.
+STANDARD_LIBRARY = {*sys.stdlib_module_names, "annotationlib"}
 # Why something is required that nothing here imports; by distribution.
 NOT_IMPORTED = {
     "psycopg": "SQLAlchemy loads it for PostgreSQL",
@@ -33,6 +36,8 @@ NOT_IMPORTED = {
     "pytest-xdist": "a plugin of pytest, for `make unit`",
     "types-pyyaml": "types, for mypy",
 }
+# Gymnasium's own environments import it, by the same name from either.
+DRAWN_WITH = {"pygame", "pygame-ce"}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +65,7 @@ def imported(folder: Path, names: Sequence[str] | set[str]) -> set[str]:
             elif isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip":
                 tops.add(ast.literal_eval(node.args[0]).partition(".")[0])
     local = {path.stem for path in (folder / "tests").rglob("*.py")} | {"tests"} | OWN
-    others = sorted(tops - sys.stdlib_module_names - local)
+    others = sorted(tops - STANDARD_LIBRARY - local)
     # An extra that is not installed here is not in what Python knows of its packages; MuJoCo's is in several parts.
     known = {"sklearn": ["scikit-learn"], **packages_distributions(), "mujoco": ["mujoco"]}
     return {normal(known[top][0]) if top in known else normal(top) for top in others}
@@ -72,7 +77,25 @@ def test_the_code_imports_what_it_requires_and_requires_what_it_imports(
     required = distributions(project["dependencies"])
     optional = project["optional-dependencies"]
     used = imported(pytestconfig.rootpath, OWN)
-    assert used - distributions([*optional["tpe"], *optional["forest"], *optional["box2d"]]) == required
+    optionally = distributions([*optional["tpe"], *optional["forest"], *optional["box2d"]])
+    assert (used - optionally) | DRAWN_WITH == required
+
+
+def asked_for(requirements: Sequence[str], python: str, extra: str = "") -> set[str]:
+    """What requirements ask for with a version of Python, with what the extras in them ask for of packages here."""
+    found = set()
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is None or requirement.marker.evaluate({"python_version": python, "extra": extra}):
+            found.add(normal(requirement.name))
+            for name in requirement.extras:
+                found |= asked_for(requires(requirement.name) or [], python, name)
+    return found
+
+
+@pytest.mark.parametrize(("python", "drawn_with"), [("3.11", "pygame"), ("3.13", "pygame"), ("3.14", "pygame-ce")])
+def test_environments_are_drawn_with_what_has_wheels(project: dict[str, Any], python: str, drawn_with: str) -> None:
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["test"]]
+    assert asked_for(wanted, python) & DRAWN_WITH == {drawn_with}
 
 
 def test_the_extras_are_what_the_tests_import(project: dict[str, Any], pytestconfig: pytest.Config) -> None:

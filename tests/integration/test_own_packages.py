@@ -192,3 +192,14 @@ def test_environments_in_the_users_packages_are_found_by_id_and_for_other_proces
     )
     stdout, _ = project(script, {"policies/__init__.py": ENV, "analysis/envs/walks.py": ENV})
     assert stdout.splitlines() == ["['policies:Walk', 'analysis.envs.walks:Walk']", "True"]
+
+
+def test_in_a_folder_that_was_deleted_the_rest_of_the_path_is_looked_in(tmp_path: Path) -> None:
+    (gone := tmp_path / "gone").mkdir()
+    (tmp_path / "analysis.py").write_text("LEVEL = 3\n")
+    code = (
+        f"import os, sys\nos.chdir({str(gone)!r})\nos.rmdir({str(gone)!r})\nsys.path[:0] = ['', {str(tmp_path)!r}]\n"
+        "import tune_jobs\nfrom analysis import LEVEL\nprint(LEVEL)\n"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("3\n", "")

@@ -100,6 +100,13 @@ def test_what_is_installed_is_pinned_and_of_this_version(config: dict[str, Any])
     assert any(f"{wheel}[cluster]" in command for command in installs)
 
 
+def test_new_code_of_the_same_version_is_installed_too(config: dict[str, Any]) -> None:
+    wheel = f"tune_jobs-{PROJECT['version']}-py3-none-any.whl"
+    first, again = [command for command in config["setup_commands"] if wheel in command]
+    assert "[cluster]" in first
+    assert {"--no-deps", "--force-reinstall", f"~/install/{wheel}"} <= set(again.split())
+
+
 def test_your_machine_gets_what_the_launcher_needs_too(config: dict[str, Any]) -> None:
     told = (ROOT / "docker" / "README.md").read_text().partition("## Virtual machines")[2].partition("\n## ")[0]
     commands = told.split("```")[1].splitlines()

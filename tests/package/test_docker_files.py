@@ -69,6 +69,15 @@ def test_torch_is_its_cpu_build_unless_the_argument_is_empty() -> None:
     assert built == [{argument: default.strip('"')}, {argument: ""}]
 
 
+def test_what_is_thrown_away_may_be_missing(tmp_path: Path) -> None:
+    """Wheels of other platforms lack some of it, as TensorBoard's for ARM its second reader."""
+    (thrown,) = [rest for rest in rest_of("RUN") if "tensorboard_data_server" in rest]
+    commands = [command for command in thrown.split("&&") if command.split()[0] == "rm"]
+    assert commands
+    for command in commands:
+        subprocess.run(["sh", "-ec", command], cwd=tmp_path, check=True)
+
+
 def test_the_whole_package_is_copied_and_nothing_else_is_sent() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     packages = [name.rstrip("*") for name in project["tool"]["setuptools"]["packages"]["find"]["include"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from tune_jobs.ray_tune import population
 from tune_jobs.ray_tune.population import Population
 from tune_jobs.ray_tune.scheduling import CopyFrom, Decision, NobodyWaits, Standing
 from tune_jobs.search.bandit import Next
+from tune_jobs.search.gains import Score
 from tune_jobs.spec.file import load_spec
 
 pytestmark = pytest.mark.ray
@@ -53,6 +55,40 @@ def test_values_that_another_was_given_at_the_same_comparison_are_known(monkeypa
     asked.clear()
     judge.compared([Standing(names[2], 4_000, -1.0, evaluated=True)], NobodyWaits())
     assert [coming.meanwhile[0] for coming in asked] == [points["t0000"]]
+
+
+def test_what_intervals_have_gained_is_read_once_for_all_copies_of_a_comparison_and_anew_at_the_next() -> None:
+    scheduler = {"type": "pb2", "perturb_every_env_steps": 1_000, "quantile_fraction": 0.5}
+    spec = load_spec(
+        {
+            "env": "CartPole-v1", "algorithm": "ppo", "space": {"lr": {"loguniform": [1e-4, 1e-2]}}, "num_samples": 8,
+            "scheduler": scheduler,
+        }
+    )  # fmt: skip
+    records = {
+        f"t{index:04d}": TrialRecord(
+            trial_id=f"t{index:04d}", index=index, point_index=index, seed=index, point={"lr": 1e-3 + index * 1e-4}
+        )
+        for index in range(8)
+    }
+    scores = {name: [Score(1, 500, 0.0), Score(2, 1_000, float(name[1:]))] for name in records}
+    asked: list[Sequence[str]] = []
+
+    def curves(trial_ids: Sequence[str]) -> dict[str, list[Score]]:
+        asked.append(trial_ids)
+        return scores
+
+    def compared(num_env_steps: int) -> dict[str, Decision | CopyFrom]:
+        standings = [Standing(name, num_env_steps, float(name[1:]), evaluated=True) for name in records]
+        return judge.compared(standings, NobodyWaits())
+
+    judge = Population(spec, records.__getitem__, curves)
+    for name in records:
+        judge.begins(name)
+    for num_comparisons in (1, 2):
+        decided = compared(1_000 * num_comparisons)
+        assert [name for name in records if isinstance(decided[name], CopyFrom)] == list(records)[:4]
+        assert asked == [list(records)] * num_comparisons
 
 
 @pytest.mark.parametrize("type_", ["pbt", "pb2"])

@@ -167,6 +167,27 @@ def test_a_trial_that_goes_on_fills_its_memory_in_ordinary_iterations(tmp_path: 
     engine.close()
 
 
+def test_a_trial_has_no_larger_memory_than_it_fills_and_what_is_restored_has_it_whole(tmp_path: Path) -> None:
+    from tune_jobs.training.rllib import RLlibEngine
+
+    ends = []
+    for capacity in (2_000, 10**15):
+        task = task_of(tmp_path, replay_capacity=capacity)
+        engine = RLlibEngine()
+        engine.build(task, None)
+        stats = [engine.train_iteration() for _ in range(2)]
+        assert len(engine.algorithm.replay) <= engine.algorithm.replay.capacity < 100
+        ends.append((stats, weights_of(engine.algorithm)))
+        engine.close()
+    (stats, weights), (stats2, weights2) = ends
+    assert stats == stats2
+    for name, value in weights.items():
+        np.testing.assert_array_equal(weights2[name], value, err_msg=name)
+    algorithm = restored(checkpoint_of(task_of(tmp_path, replay_capacity=3_000), "rllib", 1), "rllib")
+    assert algorithm.replay.capacity == 3_000
+    algorithm.stop()
+
+
 def test_however_large_its_memory_was_a_trial_is_built_without_an_env_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,9 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from analysis.records import IterationRecord
+from analysis.records import ChangeRecord, IterationRecord, TrialRecord
 from tune_jobs.search.bandit import MOST_INTERVALS, Gain, Next, _unit, _value, propose
-from tune_jobs.search.gains import Evaluations
+from tune_jobs.search.gains import Evaluations, Score, gains_of
 from tune_jobs.search.mutation import mutate
 from tune_jobs.spec.domains import Domain
 from tune_jobs.store.sweep_store import SweepStore
@@ -93,6 +94,46 @@ def test_the_ends_of_a_range_are_in_it_whatever_rounding_makes_of_their_logarith
         value = _value(domain, unit)
         assert domain.gives(value), (given, value)
         assert _unit(domain, value) == pytest.approx(unit, abs=1e-3)
+
+
+class Counted(tuple[Any, ...]):
+    """A tuple that counts how often its items are gone through from either end."""
+
+    __slots__ = ()
+    num_passes = 0
+
+    def __iter__(self) -> Iterator[Any]:
+        Counted.num_passes += 1
+        return super().__iter__()
+
+    def __reversed__(self) -> Iterator[Any]:
+        Counted.num_passes += 1
+        return iter(self[::-1])
+
+
+def test_changes_and_scores_are_not_gone_through_for_each_interval_and_need_not_be_in_order() -> None:
+    rng = np.random.default_rng(0)
+    curve = Counted(Score(at, 100 * at, float(rng.integers(9))) for at in range(1, 401))
+    ends = rng.integers(0, 400, size=100).tolist()
+    changes = Counted(
+        ChangeRecord(
+            iteration=at, num_env_steps=100 * at, source_trial_id="t0001", source_iteration=at // 2,
+            before={"number": number}, after={}, time=0.0,
+        )
+        for number, at in enumerate(ends)
+    )  # fmt: skip
+    trial = TrialRecord(trial_id="t0000", index=0, point_index=0, seed=0, point={"number": -1})
+    trial = trial.model_copy(update={"changes": changes})
+    Counted.num_passes = 0
+    found = gains_of([trial], {"t0000": curve, "t0001": curve}, 100)
+    assert Counted.num_passes < 10
+    # The first change that is not before an interval's end says what it was trained with.
+    assert len(found) == 399
+    assert [one.point["number"] for one in found] == [
+        next((number for number, at in enumerate(ends) if at >= one.time), -1) for one in found
+    ]
+    copied = [(at, one.before) for at, one in enumerate(found, start=1) if at in ends and at > 1]
+    assert copied == [(at, curve[at // 2 - 1].value) for at, _ in copied]
 
 
 def test_evaluations_that_were_read_stay_known_while_the_results_can_not_be_read(tmp_path: Path) -> None:

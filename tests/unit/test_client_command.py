@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import click
 import httpx2
@@ -22,7 +22,7 @@ from tests.narrowing import present
 from tune_jobs.cli.commands import cli
 from tune_jobs.cli.server import THERE
 from tune_jobs.client import Client
-from tune_jobs.client.answers import FileOfSweep
+from tune_jobs.client.answers import FileOfSweep, Planned
 from tune_jobs.store.names import FILMS
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps.outcome import Film
@@ -141,6 +141,24 @@ def test_a_plan_is_the_services(run: RunCommand, site: Live, tmp_path: Path) -> 
     assert wrong.exit_code == 2
     assert "poles.yaml: 2 problems" in wrong.stderr
     assert "(from --set)" in wrong.stderr
+
+
+def test_a_plan_of_a_newer_service_is_not_the_files_fault(
+    run: RunCommand, site: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "poles.yaml").write_text(YAML)
+    plan = Client.plan
+
+    def newer(self: Client, *args: Any, **options: Any) -> Planned:
+        found = plan(self, *args, **options)
+        return found.model_copy(update={"spec": found.spec | {"mood": "good"}})
+
+    monkeypatch.setattr(Client, "plan", newer)
+    told = run("--server", site.url, "launch", "poles.yaml", "--dry-run")
+    assert told.exit_code == 5
+    assert f"The service at {site.url} answers what this tune-jobs does not know: mood: there is no" in told.stderr
+    assert "update the older one of the two" in told.stderr
+    assert "SweepSpec" not in told.stderr
 
 
 # -- files

@@ -1,6 +1,7 @@
 """A trial that goes on from a copy of another's checkpoint, with values of its own."""
 
 import dataclasses
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -151,6 +152,41 @@ def test_a_damaged_copy_is_set_aside_and_the_trial_goes_on_from_its_own_checkpoi
     assert trial.loop.iteration == 5
     assert (trial.store.folder / "damaged" / "copied-000005" / "engine.json").is_file()
     assert "the copied checkpoint 000005 is damaged" in trial.run_to(6).notes[0]
+
+
+def test_of_a_copy_that_is_missing_a_note_is_kept(tmp_path: Path, better: TrialStore) -> None:
+    taken_over(tmp_path, better)
+    shutil.rmtree(TrialStore(tmp_path, "t0000").copied_checkpoint(5))
+    trial = Trial(tmp_path, engine=Recording(), changes=(change(5),))
+    assert built(trial).checkpoint == trial.store.checkpoint_folder(5)
+    note = "the copied checkpoint 000005 is missing; the trial goes on from its own latest checkpoint, with the values "
+    assert trial.run_to(6).notes == (f"{note}it was given.",)
+    # From here on it needs none.
+    assert Trial(tmp_path, engine=Recording(), changes=(change(5),)).run_to(7).notes == ()
+
+
+def test_a_copy_is_on_disk_before_the_record_that_counts_on_it(
+    tmp_path: Path, better: TrialStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = TrialStore(tmp_path, "t0000")
+    done: list[str] = []
+    replace = Path.replace
+
+    def replacing(path: Path, target: Path) -> Path:
+        done.append("its name is given")
+        return replace(path, target)
+
+    def syncing(descriptor: int) -> None:
+        done.append(str(Path(f"/proc/self/fd/{descriptor}").readlink().relative_to(own.folder / "copied")))
+
+    monkeypatch.setattr(Path, "replace", replacing)
+    monkeypatch.setattr(os, "fsync", syncing)
+    copy_latest_checkpoint(better, own, 5)
+    copy = own.copied_checkpoint(5)
+    files = {f".000005/{path.relative_to(copy)}" for path in copy.rglob("*")}
+    *before, name, last = done
+    assert set(before) == {*files, ".000005"}
+    assert (name, last) == ("its name is given", ".")
 
 
 def test_a_damaged_checkpoint_is_not_copied(tmp_path: Path, better: TrialStore) -> None:

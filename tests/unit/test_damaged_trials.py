@@ -75,6 +75,17 @@ def test_a_trial_all_of_whose_checkpoints_are_damaged_begins_again_and_says_so(t
     assert all("the trial goes on from its start" in note for note in notes)
 
 
+@pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "._engine.json"])
+def test_a_checkpoint_that_somebody_has_looked_into_is_gone_on_from(tmp_path: Path, name: str) -> None:
+    Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1}).run_to(4)
+    (TrialStore(tmp_path, "t0000").checkpoint_folder(4) / name).write_bytes(b"\0\0\0\1Bud1")
+    again = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 1})
+    assert again.engine.builds == ["000004"]
+    assert [record.iteration for record in again.results] == [1, 2, 3, 4]
+    assert again.run_to(6).notes == ()
+    assert again.kept[-1] == 6
+
+
 def test_a_checkpoint_set_aside_twice_is_kept_twice(tmp_path: Path) -> None:
     for _ in range(2):
         trial = Trial(tmp_path, checkpoints={"every_iterations": 2, "keep": 3})

@@ -9,7 +9,7 @@ import pytest
 from fake_sweeps import FakeSweeps, RunCommand, run, sweeps  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
-from analysis.records import JobRecord
+from analysis.records import JobRecord, ReplicationRecord
 from tune_jobs.cli.output import show_result
 from tune_jobs.store.opening import resume_command
 from tune_jobs.store.sweep_store import SweepStore
@@ -122,3 +122,34 @@ def test_a_copied_sweep_is_called_after_its_folder(run: RunCommand, store: Sweep
     assert f"resume {shlex.quote(str(copy))}` continues it" in told
     assert verbs.status(copy).sweep.name == "backup"
     assert "place" not in run("status", copy, "--json").stdout
+
+
+def test_a_sweep_that_was_killed_between_its_trials_and_more_seeds_for_its_leaders_is_told_how_they_get_them(
+    run: RunCommand, tmp_path: Path
+) -> None:
+    store = make_sweep_folder(tmp_path / "raced", num_samples=4, seeds_per_point=1, confirm={"max_share": 2.0})
+    command = f"tune-jobs resume {shlex.quote(store.place)}"
+    told = f"nothing runs; `{command}` does what follows the trials: more seeds for its leading settings (confirm)"
+    assert told in run("status", store.folder).stdout
+    assert "lacks_seeds" not in run("status", store.folder, "--json").stdout + repr(verbs.status(store.folder))
+    shown = run("attach", store.folder)
+    assert shown.exit_code == 0
+    left_out = "the 4 leading settings got no more seeds (confirm), as nothing followed the trials"
+    # A terminal's width breaks lines.
+    words = " ".join(shown.stdout.split())
+    assert f"no best policy: none was chosen, and {left_out}: `{command}` does both" in words
+    assert "tune-jobs best" not in words
+    with store.lock():
+        assert told not in run("status", store.folder).stdout
+    change(store, replications=(ReplicationRecord(num_points=4, points=(3, 2), by="confirm"),))
+    assert told not in run("status", store.folder).stdout
+
+
+@pytest.mark.parametrize("spec", [{}, {"num_samples": 1, "seeds_per_point": 4, "confirm": {"max_share": 2.0}}])
+def test_one_whose_leaders_get_none_has_its_best_policy_chosen_alone(
+    run: RunCommand, tmp_path: Path, spec: dict[str, Any]
+) -> None:
+    store = make_sweep_folder(tmp_path / "mine", **spec)
+    assert "nothing runs" not in run("status", store.folder).stdout
+    words = " ".join(run("attach", store.folder).stdout.split())
+    assert f"none was chosen. `tune-jobs best {store.place}` does it" in words

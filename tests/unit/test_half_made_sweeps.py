@@ -2,14 +2,20 @@
 
 import errno
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from s3_faults import Faults, Opened
-from store_parts import make_sweep
+from store_parts import killed, make_sweep, make_trial
+from stores import Harness
 
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.store import names
+from tune_jobs.store.contract import Sweep, Trial
+from tune_jobs.store.half_made import free_half_made
+from tune_jobs.store.local_storage import LocalStorage
 from tune_jobs.store.objects import bucket
 from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.patience import impatient
@@ -84,6 +90,29 @@ def test_a_sweep_behind_a_link_is_not_deleted(tmp_path: Path) -> None:
     assert not there.folder.exists()
 
 
+def test_a_removal_that_is_killed_half_way_leaves_the_name_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = SweepStore(tmp_path / "mine")
+
+    def make() -> None:
+        store.create()
+        store.write_record(make_sweep())
+        store.trial("t0000").write_record(make_trial())
+
+    def killed_in_it(kill: Callable[..., None]) -> None:
+        monkeypatch.setattr(shutil, "rmtree", lambda path, **_: kill() if Path(path).exists() else None)
+        store.delete()
+
+    make()
+    killed(killed_in_it)
+    assert [path.name for path in tmp_path.iterdir()] == [".mine.deleted"]
+    assert LocalStorage(tmp_path).sweeps() == []
+    make()
+    store.delete()
+    assert list(tmp_path.iterdir()) == []
+
+
 # -- in an object store
 
 
@@ -121,3 +150,36 @@ def test_the_claim_of_another_process_stays(faults: Faults, opened: Opened) -> N
     with pytest.raises(StorageError):
         opened().create()
     assert [item.key for item in opened()._bucket.listed()] == ["claim"]
+
+
+# -- in each
+
+
+def test_what_a_killed_process_has_written_of_a_sweep_is_removed(harness: Harness, sweep: Sweep, trial: Trial) -> None:
+    with sweep.lock():
+        trial.write_record(make_trial())
+    free_half_made(harness.storage(), "mine")
+    assert harness.keys("mine") == set()
+    harness.storage().new_sweep("mine").create()
+
+
+def test_of_a_name_that_is_free_nothing_is_made(harness: Harness) -> None:
+    free_half_made(harness.storage(), "mine")
+    assert not harness.storage().is_taken("mine")
+
+
+def test_what_is_being_written_is_left_alone(harness: Harness, sweep: Sweep, trial: Trial) -> None:
+    with sweep.lock():
+        trial.write_record(make_trial())
+        free_half_made(harness.storage(), "mine")
+        sweep.write_record(make_sweep())
+    assert [found.name for found in harness.storage().sweeps()] == ["mine"]
+    assert harness.storage().sweep("mine").read_trials() == [make_trial()]
+
+
+@pytest.mark.parametrize("key", ["sweep.json", "notes.txt", "best/policy.json"])
+def test_what_is_more_than_a_new_sweep_is_left_alone(harness: Harness, sweep: Sweep, key: str) -> None:
+    harness.put("mine", key, b"{}")
+    before = harness.keys("mine")
+    free_half_made(harness.storage(), "mine")
+    assert harness.keys("mine") == before

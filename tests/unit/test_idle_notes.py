@@ -1,5 +1,6 @@
 """Hyperparameters that can't act: a search over one is refused, what acts in some points alone is told."""
 
+import re
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from policies.errors import SpecError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
+from tune_jobs.spec.rules import idle_settings
 
 PPO = {"algorithm": "ppo"}
 DQN = {"algorithm": "dqn", "stop": {"num_env_steps": 5000}}
@@ -47,6 +49,24 @@ def test_settings_that_cannot_act_are_told(section: dict[str, dict[str, Any]], t
     found = notes(**{**PPO, **section})
     assert len(found) == len(told)
     assert all(note.startswith(words) for note, words in zip(found, told, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["pbt", "pb2"])
+def test_in_a_population_without_settings_nothing_judges_or_confirms_them(kind: str) -> None:
+    def told(**fields: Any) -> list[str]:
+        space = {"lr": {"loguniform": [1e-4, 1e-2]}}
+        spec = load_spec({**MINIMAL, **PPO, "space": space, "num_samples": 4, "scheduler": kind, **fields})
+        return idle_settings(spec)
+
+    why = rf"trials of a population \(scheduler.type {kind}\) change their values while they train"
+    (objective,) = told(objective="area")
+    assert re.match(rf"objective.type area is for charts of the report alone: {why}", objective)
+    (confirm,) = told(confirm={"top": 3})
+    assert re.match(rf"confirm can't act: {why}", confirm)
+    assert len(told(objective="steps_to_threshold", confirm={"max_share": 0.25})) == 2
+    # What nobody changed, or asked for no confirmation, is as it is.
+    assert told() == told(objective="final", confirm=True) == told(confirm="none") == []
+    assert told(scheduler="asha", objective="area", confirm={"top": 3}) == []
 
 
 # -- searched, and idle in all points: refused

@@ -3,6 +3,8 @@
 import errno
 import functools
 import json
+import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -98,6 +100,69 @@ def test_a_file_that_the_manifest_does_not_name_is_refused(
     (folder / name).write_text("something that would be unpickled")
     with pytest.raises(CheckpointError, match=f"holds the file {name}"):
         verify_checkpoint(folder)
+
+
+OF_SYSTEMS = (
+    ".DS_Store", "Thumbs.db", "desktop.ini", "._policy.json", "._manifest.json", "._rllib", "rllib/.DS_Store",
+    ".nfs0000000000a1b2c300000001",
+)  # fmt: skip
+NOT_OF_SYSTEMS = (
+    ".DS_Store2", "x.DS_Store", ".DS_Store/state.pkl", "thumbs.db.pkl", ".nfs", ".nfsstate", "._", "rllib/._", "._.",
+    "._..", "._gone.json", "rllib/._policy.json",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_SYSTEMS)
+@pytest.mark.parametrize("kind", ["checkpoint", "old_checkpoint"])
+def test_what_a_system_leaves_in_a_folder_that_is_looked_at_or_copied_is_no_damage(
+    request: pytest.FixtureRequest, tmp_path: Path, kind: str, name: str
+) -> None:
+    """A trial was begun again because its checkpoint had been opened in Finder."""
+    folder = request.getfixturevalue(kind)
+    (folder / "rllib").mkdir(exist_ok=True)
+    (folder / name).write_bytes(b"\0\0\0\1Bud1")
+    record = verify_checkpoint(folder)
+    assert all(file.name != name.rpartition("/")[2] for file in manifests.files_of(folder).values())
+    # It may be gone again by the next look.
+    manifests.write_manifest(folder, record)
+    (folder / name).unlink()
+    assert verify_checkpoint(folder) == record
+
+
+@pytest.mark.parametrize("name", NOT_OF_SYSTEMS)
+def test_a_file_of_a_name_like_a_systems_is_refused(checkpoint: Path, name: str) -> None:
+    (checkpoint / "rllib").mkdir(exist_ok=True)
+    (checkpoint / name).parent.mkdir(exist_ok=True)
+    (checkpoint / name).write_text("something that would be unpickled")
+    with pytest.raises(CheckpointError, match=f"holds the file {re.escape(name)},"):
+        verify_checkpoint(checkpoint)
+
+
+@pytest.mark.parametrize("name", [".DS_Store", "._policy.json"])
+def test_what_is_called_like_a_systems_file_and_is_none_is_refused(checkpoint: Path, name: str) -> None:
+    os.mkfifo(checkpoint / name)
+    with pytest.raises(CheckpointError, match="named pipe"):
+        verify_checkpoint(checkpoint)
+    (checkpoint / name).unlink()
+    (checkpoint / name).symlink_to(checkpoint / "policy.json")
+    with pytest.raises(CheckpointError, match="symbolic link"):
+        verify_checkpoint(checkpoint)
+
+
+def test_a_file_that_nfs_removes_meanwhile_is_no_damage(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = checkpoint / ".nfs0000000000a1b2c300000001"
+    path.touch()
+    is_folder = manifests.is_folder  # type: ignore[attr-defined]
+
+    def asked(of: Path) -> bool:
+        found: bool = is_folder(of)
+        if of == path:
+            path.unlink()
+        return found
+
+    monkeypatch.setattr(manifests, "is_folder", asked)
+    verify_checkpoint(checkpoint)
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("name", ["policy.json", "manifest.json", "rllib"])

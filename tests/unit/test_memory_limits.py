@@ -26,7 +26,7 @@ PIXELS: dict[str, Any] = {
     },
     "space": {"lr": {"uniform": [1e-4, 1e-3]}},
     "num_samples": 16,
-    "stop": {"num_env_steps": 20_000},
+    "stop": {"num_env_steps": 100_000},
 }  # fmt: skip
 MIXED: dict[str, Any] = {
     "env": {"id": "CartPole-v1", "pixels": True},
@@ -64,8 +64,69 @@ def test_on_a_cluster_the_setting_is_named_that_such_a_scheduler_takes() -> None
     planned(PIXELS, 64e9, scheduler="pbt", resources={"num_cpus": 2})
 
 
+# -- what the processes themselves take
+
+
+@pytest.mark.parametrize(("num_cpus", "gb"), [(1, 1), (2, 3), (4, 6), (8, 12), (16, 24), (64, 96)])
+def test_processes_do_not_count_where_there_is_memory_for_each_cpu(num_cpus: int, gb: float) -> None:
+    machine = Machine(num_cpus, memory_bytes=gb * 1e9)
+    half = gb * 1e9 / num_cpus / 2
+    for num_bytes in (0, 2e6, 0.5 * half):
+        assert lowered_by_memory(machine, num_bytes, num_cpus, cpus=1, algorithm="ppo") == (num_cpus, ())
+
+
+def test_fewer_trials_run_at_once_where_their_processes_take_the_memory() -> None:
+    machine = Machine(64, memory_bytes=8e9)
+    number, (note,) = lowered_by_memory(machine, 2e6, 64, cpus=1, algorithm="ppo")
+    assert number == 14
+    what = "14 trials instead of 64 run at once: one trial and its process may take 352.0 MB of memory"
+    assert note == f"{what}, and what this machine has available beside Ray's own processes is 5.2 GB."
+    # Each with two env runners.
+    number, (note,) = lowered_by_memory(machine, 2e6, 21, cpus=3, algorithm="ppo", num_processes=3)
+    assert (number, "one trial and its processes may take 1.1 GB" in note) == (4, True)
+    # A trial that plays at random imports less.
+    assert lowered_by_memory(machine, 0, 64, cpus=1, algorithm="random")[0] == 39
+    # None is trained alone.
+    assert lowered_by_memory(machine, 0, 64, cpus=1, algorithm="ppo", num_processes=0) == (64, ())
+    # One runs in any case.
+    number, (note,) = lowered_by_memory(Machine(64, memory_bytes=2e9), 2e6, 64, cpus=1, algorithm="ppo")
+    assert (number, note.startswith("Trials run one at a time: one trial and its process may take")) == (1, True)
+
+
+def test_on_a_cluster_it_is_said_that_processes_take_the_memory() -> None:
+    machine = Machine(64, memory_bytes=8e9, nodes=((64.0, 0.0),))
+    number, (note,) = lowered_by_memory(machine, 2e6, 64, cpus=1, algorithm="ppo")
+    assert number == 64
+    assert note.endswith("may take 352.0 MB of memory: set resources.max_concurrent.")
+
+
+def test_a_plan_counts_the_processes_of_trials_that_are_not_packed() -> None:
+    source: dict[str, Any] = {"env": "CartPole-v1", "algorithm": "ppo", "num_samples": 64, "confirm": "none"}
+    source["space"] = {"lr": {"uniform": [1e-4, 1e-3]}}
+    machine = Machine(64, memory_bytes=8e9)
+    alone = make_plan(load_spec(source | {"engine": "rllib"}), machine)
+    assert alone.max_concurrent == 14
+    assert any(note.startswith("14 trials instead of 64 run at once") for note in alone.notes)
+    runners = make_plan(load_spec(source | {"engine": "rllib", "resources": {"num_env_runners": 2}}), machine)
+    assert runners.max_concurrent == 4
+    # A pack's process shares what it imports.
+    packed = make_plan(load_spec(source), machine)
+    assert (packed.max_concurrent, packed.notes) == (64, ())
+
+
 def planned(fields: dict[str, Any], memory_bytes: float, **changes: Any) -> SweepPlan:
     return make_plan(load_spec(fields | changes), Machine(16, memory_bytes=memory_bytes))
+
+
+@pytest.mark.parametrize("stop", [{"num_env_steps": 100_000}, {"num_env_steps": 10**8, "num_iterations": 100}])
+def test_a_replay_memory_counts_as_large_as_the_training_fills_it(stop: dict[str, int]) -> None:
+    small, large = (PIXELS["hyperparams"] | {"replay_capacity": capacity} for capacity in (100_000, 1_000_000))
+    assert planned(PIXELS, 8e9, hyperparams=large, stop=stop).max_concurrent == 8
+    most = planned(PIXELS, 8e9, stop=stop).max_env_steps_per_trial
+    assert 100_000 <= most < 101_010
+    whole = planned(PIXELS, 8e9, hyperparams=small | {"replay_capacity": most}, stop=stop)
+    assert planned(PIXELS, 8e9, hyperparams=large, stop=stop).notes == whole.notes
+    assert planned(PIXELS, 8e9, hyperparams=large, stop={"num_env_steps": 1_000_000}).max_concurrent == 1
 
 
 @pytest.mark.parametrize("scheduler", ["pbt", "hyperband"])

@@ -4,13 +4,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 from s3_faults import Faults, Opened, iterations
 from store_parts import fill, make_checkpoint, make_iteration, make_trial
 
 from policies.errors import CheckpointError
+from tune_jobs.store.objects import result_chunks
 from tune_jobs.store.objects.bucket import Bucket, Tag
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.ownership import OwnershipLostError
@@ -116,17 +117,45 @@ def test_copies_that_are_to_go_while_an_older_checkpoint_is_uploaded_go_with_the
     assert seen == [True, False]
 
 
+def test_results_that_are_replaced_while_they_are_uploaded_are_those_that_others_see(
+    faults: Faults, opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(result_chunks, "_SMALL_BYTES", 1)
+    trial, reader = opened().trial("t0000"), opened().trial("t0000")
+    trial.take()
+    for number in (1, 2):
+        trial.append_iterations([make_iteration(number)])
+        trial.settle()
+    assert [record.iteration for record in reader.read_results().records] == [1, 2]
+
+    def go_back() -> None:
+        # It continues from its first checkpoint, and comes farther than before.
+        trial.keep_iterations([make_iteration(1)])
+        trial.append_iterations([make_iteration(number) for number in (4, 5, 6, 7)])
+
+    faults.rule("slow", kinds="PUT", keys="/results/", then=go_back)
+    trial.append_iterations([make_iteration(3)])
+    trial.settle()
+    assert iterations(opened) == [1, 4, 5, 6, 7]
+    assert [record.iteration for record in reader.read_results().records] == [1, 4, 5, 6, 7]
+
+
 def test_readers_that_look_at_once_see_each_result_once(
     faults: Faults, opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_bytes = Path.read_bytes
+    read_bytes, open_one = Path.read_bytes, Path.open
 
     def slowly(path: Path) -> bytes:
         content = read_bytes(path)
         time.sleep(0.02 if path.name == "results.jsonl" else 0)
         return content
 
+    def to_append(path: Path, mode: str = "r", *given: Any, **more: Any) -> IO[Any]:
+        time.sleep(0.02 if mode == "ab" else 0)
+        return open_one(path, mode, *given, **more)
+
     monkeypatch.setattr(Path, "read_bytes", slowly)
+    monkeypatch.setattr(Path, "open", to_append)
     trial, reader = opened().trial("t0000"), opened().trial("t0000")
     trial.take()
     for number in range(1, 3):

@@ -1,5 +1,6 @@
 """How many requests a sweep in an object store takes, and which of them wait for each other."""
 
+import shutil
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -8,15 +9,20 @@ from typing import cast
 
 import pytest
 from fake_pack import Pack, statuses
-from s3_faults import Faults, Opened
+from s3_faults import Faults, Opened, iterations
 from store_parts import fill, make_checkpoint, make_iteration, make_sweep, make_trial
 
 from analysis.records import CheckpointRecord
+from tune_jobs.service.statuses import Statuses
 from tune_jobs.store import names
-from tune_jobs.store.objects import lease, owners
+from tune_jobs.store.objects import clients, lease, owners, result_chunks
 from tune_jobs.store.objects.bucket import Found
+from tune_jobs.store.objects.head import read_head
 from tune_jobs.store.objects.held import Held
+from tune_jobs.store.objects.object_storage import ObjectStorage
 from tune_jobs.store.objects.object_sweep import ObjectSweep
+from tune_jobs.store.objects.object_trial import ObjectTrial
+from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.opening import others_write
 
 NUM_TRIALS = 3
@@ -55,12 +61,85 @@ def test_records_that_have_not_changed_are_not_fetched_again(
     assert faults.counts() == {"GET": 1, "LIST": 1}
 
 
+def test_all_sweeps_of_a_bucket_share_their_connections(url: ObjectUrl, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, open_one = list[bool](), clients._open
+
+    def counted(place: ObjectUrl, *, now: bool) -> object:
+        made.append(now)
+        return open_one(place, now=now)
+
+    monkeypatch.setattr(clients, "_open", counted)
+    for number in (*range(2 * clients._MAX_CLIENTS), 0):
+        assert not ObjectSweep(url.child(str(number))).exists()
+    assert made == [False]
+
+
+def test_a_service_looks_at_all_sweeps_of_a_list_side_by_side(faults: Faults, url: ObjectUrl) -> None:
+    storage, wanted = ObjectStorage(url), [f"s{index}" for index in range(NUM_TRIALS)]
+    for name in wanted:
+        storage.sweep(name).write_record(make_sweep(name=name, state="completed"))
+    statuses = Statuses(storage)
+    for _ in range(2):
+        # At first, and when each is known.
+        all_came = threading.Barrier(NUM_TRIALS, timeout=30)
+        faults.rule("slow", kinds="GET", keys="/driver-lock.json$", times=NUM_TRIALS, then=all_came.wait)
+        assert [seen.name for seen in statuses.all()] == wanted
+        assert not all_came.broken
+
+
 def test_records_that_this_process_has_written_are_not_fetched(faults: Faults, sweep: ObjectSweep) -> None:
     for index in range(NUM_TRIALS):
         sweep.trial(f"t{index:04d}").write_record(make_trial(index, status="completed"))
     faults.clear()
     assert {record.status for record in sweep.read_trials()} == {"completed"}
     assert faults.counts() == {"LIST": 1}
+
+
+@pytest.fixture
+def long_results(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> tuple[ObjectTrial, ObjectTrial]:
+    """A trial with results in several objects, as its owner and a reader of all of them have it."""
+    monkeypatch.setattr(result_chunks, "_SMALL_BYTES", 1)
+    trial, reader = opened().trial("t0000"), opened().trial("t0000")
+    trial.take()
+    for number in (1, 2, 3):
+        append(trial, number)
+    assert numbers(reader) == [1, 2, 3]
+    return trial, reader
+
+
+def append(trial: ObjectTrial, number: int) -> None:
+    trial.append_iterations([make_iteration(number)])
+    trial.settle()
+
+
+def numbers(trial: ObjectTrial) -> list[int]:
+    return [record.iteration for record in trial.read_results().records]
+
+
+def test_a_reader_of_long_results_reads_what_is_new_alone(
+    faults: Faults, long_results: tuple[ObjectTrial, ObjectTrial]
+) -> None:
+    trial, reader = long_results
+    append(trial, 4)
+    shutil.rmtree(reader._state.folder() / "chunks")
+    faults.clear()
+    assert numbers(reader) == [1, 2, 3, 4]
+    # The head, and the newest of the objects that it names.
+    assert faults.counts() == {"GET": 2}
+    # Where its file is gone, it is made again.
+    shutil.rmtree(reader._state.folder())
+    assert numbers(reader) == [1, 2, 3, 4]
+
+
+def test_long_results_are_not_looked_through_to_upload_their_end(
+    opened: Opened, long_results: tuple[ObjectTrial, ObjectTrial]
+) -> None:
+    trial, reader = long_results
+    shutil.rmtree(trial._state.folder() / "chunks")
+    append(trial, 4)
+    head, _ = read_head(opened()._bucket, "trials/t0000/head.json")
+    assert len(head.results) == 4
+    assert numbers(reader) == iterations(opened) == [1, 2, 3, 4]
 
 
 def test_checkpoints_that_are_read_are_fetched_once_and_all_at_once(faults: Faults, sweep: ObjectSweep) -> None:

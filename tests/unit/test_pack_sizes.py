@@ -87,7 +87,8 @@ def test_a_tenth_of_many_trials_run_at_once_where_a_model_learns(
 # -- memory
 
 # Observations of 4 numbers, before and after, action, reward, discount: 48 bytes a transition.
-MEMORY: dict[str, Any] = {**DQN, "hyperparams": {"replay_capacity": 1_000_000}}
+LONG: dict[str, Any] = {**DQN, "stop": {"num_env_steps": 10_000_000}}
+MEMORY: dict[str, Any] = {**LONG, "hyperparams": {"replay_capacity": 1_000_000}}
 MEMBER = 48e6
 
 
@@ -110,6 +111,15 @@ def test_fewer_packs_where_memory_is_shorter_still() -> None:
     assert "1 x 1 trials run at once" in present(made.packs).notes[0]
 
 
+def test_fewer_packs_where_their_processes_take_the_memory() -> None:
+    assert packs(Machine(64, memory_bytes=8e9), num_samples=64) == (64, 1)
+    made = present(plan(Machine(64, memory_bytes=4e9), num_samples=64).packs)
+    assert (made.num_packs, made.slots) == (39, 1)
+    (note,) = made.notes
+    assert note.startswith("Packs are planned smaller: 64 x 1 trials at once may take 6.5 GB of memory with their ")
+    assert note.endswith("processes, and what this machine has available is 4.0 GB. 39 x 1 trials run at once.")
+
+
 def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own() -> None:
     made = plan(Machine(2, memory_bytes=MEMBER), **MEMORY)
     assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 1)
@@ -123,10 +133,10 @@ def test_a_few_large_trials_do_not_make_all_places_large() -> None:
     space = {"replay_capacity": {"grid": [1_000, 10_000_000]}}
     machine = Machine(1, memory_bytes=2.1 * (10 * MEMBER * 2))
     # Two of them, and six small ones: all fit at once.
-    assert packs(machine, **{**DQN, "space": {"replay_capacity": {"grid": [1_000]}}}) == (1, 10)
-    made = plan(machine, **DQN, space=space, num_samples=1, seeds_per_point=2)
+    assert packs(machine, **{**LONG, "space": {"replay_capacity": {"grid": [1_000]}}}) == (1, 10)
+    made = plan(machine, **LONG, space=space, num_samples=1, seeds_per_point=2)
     assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 4)
-    made = plan(machine, **DQN, space=space, num_samples=1, seeds_per_point=3)
+    made = plan(machine, **LONG, space=space, num_samples=1, seeds_per_point=3)
     assert (present(made.packs).num_packs, present(made.packs).slots) == (1, 2)
 
 
@@ -134,12 +144,21 @@ def test_a_few_large_trials_do_not_make_all_places_large() -> None:
 def test_points_that_are_not_known_count_with_the_largest_memory(search: dict[str, Any]) -> None:
     space = {"replay_capacity": {"qlograndint": [1000, 1_000_000, 1000]}}
     machine = Machine(1, memory_bytes=2.1 * 3 * MEMBER)
-    fields = {**DQN, "space": space, "num_samples": 12}
+    fields = {**LONG, "space": space, "num_samples": 12}
     if search:
         assert packs(machine, **fields, **search) == (1, 3)
     else:
         # Known points, of which many are smaller.
         assert packs(machine, **fields)[1] > 3
+
+
+def test_a_memory_counts_as_large_as_the_training_fills_it() -> None:
+    machine, larger = Machine(2, memory_bytes=2.1 * 10 * MEMBER), {"replay_capacity": 100_000_000}
+    assert packs(machine, **{**MEMORY, "hyperparams": larger, "stop": {"num_env_steps": 1_000_000}}) == (2, 5)
+    assert packs(machine, **{**MEMORY, "hyperparams": larger, "stop": {"num_env_steps": 2_000_000}}) == (2, 2)
+    # By iterations, of 1,000 env steps each, it ends too.
+    stop = {"num_env_steps": 2_000_000, "num_iterations": 1_000}
+    assert packs(machine, **{**MEMORY, "hyperparams": larger, "stop": stop}) == (2, 5)
 
 
 def test_on_a_cluster_the_node_where_packs_get_least_decides() -> None:

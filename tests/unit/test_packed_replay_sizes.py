@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from fake_engine import make_task
 from numpy.typing import NDArray
 from replay_rows import BATCH, D, make_hyperparams
 
 from policies.packed.dqn.replay import StackedPrioritizedReplay, StackedReplay, make_stacked_replay
 from policies.packed.inputs import Inputs
 from policies.sum_trees import SumTrees
+from tune_jobs.training.packed import PackedEngine
 
 KINDS = ("uniform", "prioritized", "none")
+SIZES: dict[str, Any] = {
+    "train_batch_size": 8, "learning_starts": 8, "env_steps_per_iteration": 128, "num_envs": 2, "hidden_sizes": (8,),
+}  # fmt: skip
 
 
 def memory_of(replay: str, **capacities: int) -> StackedReplay:
@@ -48,6 +55,47 @@ def test_a_large_memory_makes_no_other_one_larger(replay: str) -> None:
     if isinstance(stacked, StackedPrioritizedReplay):
         # Trees' leaves are powers of 2, 131,072 and 2,048, and together a multiple of the largest.
         assert len(stacked._priorities.leaves) == 2 * 131_072
+
+
+@pytest.mark.parametrize("replay", KINDS)
+def test_memories_for_all_that_will_come_give_the_same_batches(replay: str) -> None:
+    hyperparams = [make_hyperparams(replay=replay, replay_capacity=capacity) for capacity in (10_000, 25)]
+    whole, exact = memory_of(replay), memory_of(replay)
+    for name, own in zip("ab", hyperparams, strict=True):
+        whole.add_member(name, own)
+        exact.add_member(name, own, 60)
+    assert len(exact._rows) == (2 * BATCH if replay == "none" else 60 + 25)
+    rng, slots = np.random.default_rng(0), whole.slots(["a", "b"])
+    for _ in range(12):
+        new = rng.normal(size=(2, 5, whole.num_columns)).astype(np.float32)
+        numbers, errors = rng.random((2, BATCH)), rng.normal(size=(2, BATCH)).astype(np.float32)
+        for memory in (whole, exact):
+            memory.add(slots, new)
+        theirs, ours = whole.draw(slots, numbers), exact.draw(slots, numbers)
+        for name, expected in vars(theirs).items():
+            np.testing.assert_array_equal(getattr(ours, name), expected, err_msg=name)
+        if theirs.indices is not None:
+            for memory in (whole, exact):
+                memory.set_priorities(slots, theirs.indices, errors)
+
+
+@pytest.mark.parametrize("replay", ["uniform", "prioritized"])
+def test_a_trial_has_no_larger_memory_than_it_fills(replay: str, tmp_path: Path) -> None:
+    ends = []
+    for capacity in (2_000, 10**15):
+        hyperparams = SIZES | {"replay": replay, "replay_capacity": capacity}
+        task = replace(make_task(tmp_path, hyperparams=hyperparams, stop={"num_iterations": 4}), algorithm="dqn")
+        engine = PackedEngine("scalar")
+        engine.add(task, None)
+        stats = [engine.train_iteration()[task.trial_id] for _ in range(4)]
+        (stack,) = engine._stacks.values()
+        ends.append((stats, stack.member(task.trial_id)))
+        engine.close()
+    (stats, member), (stats2, member2) = ends
+    assert stats == stats2
+    assert member.num_updates == member2.num_updates > 0
+    for name, weight in member.weights.items():
+        np.testing.assert_array_equal(member2.weights[name], weight, err_msg=name)
 
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized"])

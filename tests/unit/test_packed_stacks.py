@@ -70,7 +70,7 @@ def test_who_shares_something_else_does_not_get_in(stack: Stack[Any, Any, Any], 
 def test_who_there_is_no_memory_for_is_no_member(
     stack: Stack[Any, Any, Any], algorithm: Algorithm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(_: AnyMember) -> None:
+    def refuse(_: AnyMember, max_env_steps: int | None) -> None:
         raise MemoryError
 
     stack.add(member(stack, algorithm, "a"), 1)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from broken_storage import pathlib_of  # noqa: F401 (a fixture)
 from sweep_folders import make_sweep_folder
 
 from policies.errors import CheckpointError
@@ -75,3 +76,18 @@ def test_a_storage_folder_that_may_not_be_looked_into_is_named(storage: Path, cl
     closed(storage)
     with pytest.raises(CheckpointError, match=f"{storage} cannot be read: Permission denied"):
         sweeps.list_sweeps(storage)
+
+
+@pytest.mark.usefixtures("pathlib_of")
+def test_what_may_not_be_looked_at_is_not_left_out_in_silence(
+    storage: Path, closed: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever Python's pathlib says of it: 3.14's says that it is not there."""
+    closed(storage / "other")
+    closed(storage / "mine" / "trials" / "t0001")
+    assert [status.sweep.name for status in sweeps.list_sweeps(storage)] == ["mine"]
+    assert f"{storage}/other/sweep.json cannot be read: Permission denied" in caplog.text
+    with pytest.raises(CheckpointError, match=r"other/sweep.json cannot be read: Permission denied"):
+        sweeps.status("other", storage=storage)
+    assert sweeps.status("mine", storage=storage).counts == {"completed": 3}
+    assert f"{storage}/mine/trials/t0001/trial.json cannot be read: Permission denied" in caplog.text

@@ -247,6 +247,9 @@ def test_disk_grows_with_networks_checkpoints_and_trials() -> None:
     assert least < 50e6
     assert plan().max_disk_bytes > least
     assert plan("num_samples=1", "checkpoints.keep=4").max_disk_bytes > least
+    # The latest is one of the newest, and is kept in any case.
+    none, one = (plan("num_samples=1", f"checkpoints.keep={keep}").max_disk_bytes for keep in (0, 1))
+    assert none == one < least
     wide = plan("num_samples=1", "space.hidden_sizes=", "hyperparams.hidden_sizes=[1024, 1024]").max_disk_bytes
     # Two networks of a million weights, 4 bytes each, with Adam's two moments, in four checkpoints, for two
     # trials.

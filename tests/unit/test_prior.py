@@ -280,3 +280,12 @@ def test_what_is_not_there_and_a_place_where_only_names_are_read_are_refused(tmp
     spec = make_spec(prior=str(tmp_path / "first"), search="gp")
     with pytest.raises(SpecError, match="no name of a sweep"):
         read_priors(spec, tmp_path, by_name=True)
+
+
+@pytest.mark.usefixtures("earlier")
+@pytest.mark.parametrize("other", ["{storage}/first", "{storage}/second", "{storage}/../{folder}/first"])
+def test_a_sweep_under_two_names_is_refused(other: str, tmp_path: Path) -> None:
+    (tmp_path / "second").symlink_to(tmp_path / "first")
+    spec = make_spec(prior=["first", other.format(storage=tmp_path, folder=tmp_path.name)], search="gp")
+    with pytest.raises(SpecError, match=r"prior: 'first' and '.* are the same sweep"):
+        read_priors(spec, tmp_path)

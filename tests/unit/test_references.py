@@ -43,6 +43,8 @@ ELSEWHERE = {
     "tensorflow", "forward_exploration",
     # Python
     "Loader", "MetaPathFinder",
+    # uv and systemd
+    "uv", "MemoryMax", "CPUQuota",
     # a user's own, and a user's mistakes
     "Net", "maze", "my_nets", "my_plots", "plot_all", "epochs",
     # parts of file names, colours and commands
@@ -245,6 +247,13 @@ def test_every_target_of_make_exists_and_is_given_none_of_a_programs_options() -
         if word not in targets and not re.fullmatch(r"[A-Z]+=\S+", word)
     }
     assert wrong == set()
+
+
+def test_nobody_is_told_to_get_tune_jobs_from_an_index_which_has_none() -> None:
+    """An extra, by its name in brackets, is added to the tune-jobs that is installed."""
+    pattern = re.compile(r"pip install(?: -\S+)* [\"']?tune-jobs\b(?!\[)")
+    texts = {path: path.read_text() for path in [*CODE, *DOCUMENTS, ROOT / "docker" / "README.md"]}
+    assert [path for path, text in texts.items() if pattern.search(text)] == []
 
 
 # Pages with what the command prints: a part of it, and the whole of it.

@@ -246,6 +246,28 @@ def test_no_transitions_change_nothing(replay: str) -> None:
         assert (ours.indices is None) == (replay != "prioritized")
 
 
+@pytest.mark.parametrize("replay", KINDS)
+def test_a_memory_for_all_that_will_come_gives_the_same_batches(replay: str) -> None:
+    values = DQNHyperparams(replay=replay, replay_capacity=1_000, train_batch_size=4)
+    whole, exact = make_replay(values, seed=3), make_replay(values, seed=3)
+    exact.expect(60)
+    for first in range(0, 60, 5):
+        for memory in (whole, exact):
+            memory.add(rows(first, 5))
+        assert len(exact) == len(whole)
+        for ours, theirs in zip(exact.batches(3, 4), whole.batches(3, 4), strict=True):
+            for name, expected in vars(theirs).items():
+                np.testing.assert_array_equal(getattr(ours, name), expected, err_msg=name)
+            if theirs.indices is not None:
+                for memory in (whole, exact):
+                    memory.set_priorities(theirs.indices, np.sin(theirs.rewards))
+    if replay != "none":
+        assert [len(memory._columns["obs"]) for memory in (whole, exact)] == [1_000, 60]
+    # A memory that is smaller stays so.
+    exact.expect(2_000)
+    assert exact.capacity == (4 if replay == "none" else 60)
+
+
 def test_the_newest_transitions_are_those_that_are_there() -> None:
     replay = LastTransitions(4, np.random.default_rng(0))
     replay.add(rows(0, 3))

@@ -144,3 +144,25 @@ def test_while_it_serves_a_process_may_open_as_many_files_as_the_system_allows(
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert during == [(65_536 if hard == resource.RLIM_INFINITY else min(hard, 65_536), hard)]
+
+
+@pytest.mark.parametrize(
+    ("at_most", "raised_to"), [(1_000_000, [65_536]), (61_440, [10_240]), (10_240, [10_240]), (1_000, [])]
+)
+@pytest.mark.parametrize("refusal", [ValueError("current limit exceeds maximum limit"), OSError(1, "No")])
+def test_a_system_that_allows_less_than_it_says_is_taken_as_it_is(
+    at_most: int, raised_to: list[int], refusal: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As macOS does, whose `ulimit -Hn` is unlimited."""
+    limits = [(256, resource.RLIM_INFINITY)]
+
+    def set_limits(_: int, asked: tuple[int, int]) -> None:
+        if asked[0] > at_most:
+            raise refusal
+        limits.append(asked)
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _: limits[-1])
+    monkeypatch.setattr(resource, "setrlimit", set_limits)
+    with connections.many_files():
+        assert [soft for soft, _ in limits[1:]] == raised_to
+    assert limits[-1] == limits[0]

@@ -1,10 +1,14 @@
 """A database is one service's: a second one is refused, whatever its storage folder, until the first one has ended."""
 
+import errno
+import fcntl
 import functools
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from databases import PostgreSQL, database_url, postgresql, started_or_skip  # noqa: F401 (fixtures)
@@ -57,6 +61,24 @@ def test_a_folder_is_one_services_and_is_named(tmp_path: Path, *, is_own: bool) 
         pass
     assert refused.value.message == f"Another service has the {'' if is_own else 'storage '}folder {named}."
     assert refused.value.hint == f"End it first, or give another {option}."
+
+
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_folder_without_locks_is_not_said_to_be_anothers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_own: bool
+) -> None:
+    def flock(descriptor: int, operation: int) -> NoReturn:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    folder, option = (tmp_path / "own", "--folder") if is_own else (tmp_path / ".service", "--storage")
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with (
+        pytest.raises(CannotRunError) as refused,
+        opened(ServiceConfig(tmp_path, own_folder=folder if is_own else None)),
+    ):
+        pass
+    assert refused.value.message == f"The service can't lock {folder / 'lock'}: Function not implemented."
+    assert refused.value.hint == f"Give another {option}, on a file system that has locks."
 
 
 def test_an_own_folder_that_is_a_file_is_no_matter_of_the_storage(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """YAML of sweep files: the words of YAML 1.2, refusals of what has two meanings, and no more than the limits."""
 
+import json
 import math
 import tracemalloc
 from pathlib import Path
@@ -173,6 +174,24 @@ def test_keys_of_digits_may_stay_empty_where_no_number_is_before_them() -> None:
 
 def test_keys_are_texts_as_they_are_written() -> None:
     assert parse_yaml("{no: 1, 010: 2, 1: 3, true: 4, ~: 5}", "x") == {"no": 1, "010": 2, "1": 3, "true": 4, "~": 5}
+
+
+def test_characters_are_read_as_json_escapes_them(tmp_path: Path) -> None:
+    args = {"\U0001f600": "a\U0001f600\U00010000b", "\U0010ffff": ["\ufeff\U0001f600", "\uffff"]}
+    path = tmp_path / "mine.json"
+    text = json.dumps({"env": {"id": "CartPole-v1", "args": args}, "algorithm": "random"})
+    path.write_text(text, encoding="utf-8")
+    assert r"\ud83d\ude00" in text
+    assert parse_yaml(text, "mine.json")["env"]["args"] == args
+    assert load_spec(path).env.args == args
+
+
+@pytest.mark.parametrize("halves", [r"\ud83d", r"\ude00", r"\ude00\ud83d", r"\ud83d\ud83d\ude00"])
+def test_half_a_character_is_refused(halves: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(f'{{"env": {{"id": "CartPole-v1", "args": {{"a": "{halves}"}}}}}}', encoding="utf-8")
+    with pytest.raises(SpecError, match="which is half a character"):
+        load_spec(path)
 
 
 def test_a_merged_mapping_gives_way_to_what_is_written() -> None:

@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from s3_faults import Opened
 from store_parts import make_iteration
 from synthetic_sweep import make_sweep
 
 from tune_jobs.store.event_files import ScalarWriter
+from tune_jobs.store.objects import parts
+from tune_jobs.store.objects.bucket import Bucket, Tag
+from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.sweep_store import SweepStore
 
 event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
@@ -129,6 +133,37 @@ def hparams_of(logdir: Path) -> Any:
     backend = Context(TBContext(data_provider=MultiplexerDataProvider(multiplexer, str(logdir))))
     request = RequestContext()
     return backend.experiment_from_metadata(request, "", True, backend.hparams_metadata(request, ""), [])
+
+
+def test_an_object_store_is_not_sent_a_long_curve_again_and_again(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    monkeypatch.setattr(parts, "_EVENTS_BYTES", 1_000)
+    sweep, trial, put = opened(), make_sweep().trials[0], Bucket.put
+    sent = list[int]()
+
+    def counted(self: Bucket, key: str, data: bytes, **given: Any) -> Tag:
+        sent.append(len(data))
+        return put(self, key, data, **given)
+
+    monkeypatch.setattr(Bucket, "put", counted)
+    writer = ScalarWriter(sweep)
+    for iteration in range(1, 61):
+        writer.write(trial, [make_iteration(iteration, training_return=float(iteration))])
+        writer.flush()
+        outbox().settle(sweep._parts.jobs)
+    assert len(sent) == 60
+    assert max(sent) < 1_500
+    # As TensorBoard reads them, one after the other by their names.
+    fetched = {item.key: tmp_path / item.key for item in sweep._bucket.listed()}
+    assert all(sweep._bucket.fetch_all(fetched).values())
+    first, *others = files(tmp_path, trial.trial_id)
+    assert first.name == writer._name
+    assert all(read(path) for path in others)
+    found = EventAccumulator(str(first.parent)).Reload().Scalars("training_return")
+    assert [(event.step, event.value) for event in found] == [(100 * n, n) for n in range(1, 61)]
 
 
 def test_writing_event_files_loads_no_torch() -> None:

@@ -1,5 +1,6 @@
 """What a plan says of environments that do what Gymnasium allows, and that those who train seldom want."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from analysis.objectives import trial_score
+from analysis.records import IterationRecord
 from policies.acting.evaluate import evaluate_policy
 from policies.acting.policy import RandomPolicy
 from policies.envs.checked import CheckedEnvs
@@ -15,7 +18,9 @@ from policies.envs.faults import env_failed
 from policies.envs.make import check_env, make_vector_env
 from policies.errors import EnvFailedError
 from policies.packed.envs.make import make_packed_envs
-from tune_jobs.plan.env_notes import env_notes
+from tune_jobs.plan.env_notes import _on_goals, env_notes
+from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.spec.file import load_spec
 
 NUMBERS = spaces.Box(-9, 9, (3,), np.float32)
@@ -308,3 +313,56 @@ def test_the_section_on_masks_is_called_so() -> None:
 
     guide = Path(__file__).parents[2] / "docs" / "guides" / "own-environment.md"
     assert "\n## Actions that are not always allowed\n" in guide.read_text()
+
+
+# -- goals below what trials are judged by
+
+BY_STEPS = {"type": "steps_to_threshold"}
+
+
+def notes_of_goals(env_threshold: float | None = 475.0, **fields: Any) -> list[str]:
+    spec = load_spec({"env": "CartPole-v1", "algorithm": "ppo", **fields})
+    return list(_on_goals(spec, dataclasses.replace(check_env("CartPole-v1", None, "ppo"), threshold=env_threshold)))
+
+
+@pytest.mark.parametrize("rule", ["evaluation_return", "training_return"])
+@pytest.mark.parametrize(
+    ("objective", "env_threshold", "whose"),
+    [
+        (BY_STEPS, 475.0, "CartPole-v1's threshold 475"),
+        ({**BY_STEPS, "threshold": 400}, 475.0, "objective.threshold 400"),
+        ({**BY_STEPS, "threshold": 400}, None, "objective.threshold 400"),
+    ],
+)
+def test_who_ends_trials_before_the_threshold_that_they_are_judged_by_is_told(
+    rule: str, objective: dict[str, Any], env_threshold: float | None, whose: str
+) -> None:
+    (told,) = notes_of_goals(env_threshold, objective=objective, stop={rule: 195})
+    assert told.startswith(f"stop.{rule} 195 is below {whose}, and objective.type is steps_to_threshold: ")
+    assert told.endswith(f"Raise stop.{rule} or leave it out, or set objective.threshold to 195.")
+    assert notes_of_goals(env_threshold, objective={**BY_STEPS, "threshold": 195}, stop={rule: 195}) == []
+    assert notes_of_goals(env_threshold, objective=objective, stop={rule: 475}) == []
+    # It counts as one that never reached it, as slow as the worst.
+    early, never = (
+        [IterationRecord(iteration=1, num_env_steps=5_120, num_episodes=1, time_s=1.0, evaluation_return=value)]
+        for value in (200.0, 9.0)
+    )
+    assert {
+        trial_score(rows, "steps_to_threshold", num_env_steps=50_000, threshold=475.0) for rows in (early, never)
+    } == {-100_000.0}
+
+
+def test_by_other_objectives_a_goal_below_the_threshold_is_a_matter_of_training_returns() -> None:
+    (told,) = notes_of_goals(stop={"training_return": 195, "evaluation_return": 195})
+    assert told == "stop.training_return 195 is below CartPole-v1's threshold 475: trials may end before they solve it."
+    assert notes_of_goals(None, stop={"training_return": 195, "evaluation_return": 195}) == []
+    population: dict[str, Any] = {"scheduler": "pbt", "space": {"lr": {"loguniform": [1e-4, 1e-2]}}, "num_samples": 4}
+    assert notes_of_goals(objective=BY_STEPS, stop={"evaluation_return": 195}, **population) == []
+
+
+def test_the_plan_tells_of_such_a_goal() -> None:
+    spec = load_spec(
+        {"env": "CartPole-v1", "algorithm": "ppo", "objective": BY_STEPS, "stop": {"evaluation_return": 195}}
+    )
+    (told,) = [note for note in make_plan(spec, Machine(2)).notes if "steps_to_threshold" in note]
+    assert told.startswith("stop.evaluation_return 195 is below CartPole-v1's threshold 475")

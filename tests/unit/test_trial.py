@@ -45,6 +45,20 @@ def test_a_trial_ends_after_so_many_seconds(tmp_path: Path) -> None:
     assert 30 <= progress.time_s < 40
 
 
+def test_a_trial_whose_evaluation_takes_it_to_its_seconds_ends_with_a_checkpoint_of_its_end(tmp_path: Path) -> None:
+    clock = FakeClock()
+
+    def scores(iteration: int) -> float:
+        clock.now += 16.0
+        return -float(iteration)
+
+    checkpoints = {"every_iterations": 10, "keep": 2}
+    trial = Trial(tmp_path, clock=clock, scores=scores, stop={"time_s": 50.0}, checkpoints=checkpoints)
+    progress = trial.run()
+    assert (progress.num_iterations, progress.time_s, progress.stop_reason) == (4, 64.0, "time_s 64 >= 50")
+    assert trial.kept == [1, 4]
+
+
 def test_the_hard_caps_hold_where_nothing_else_is_set(tmp_path: Path) -> None:
     """No rule given: the defaults end it all the same."""
     progress = Trial(tmp_path, engine=FakeEngine(steps=50_000), stop={}, evaluation={"every_iterations": 1_000}).run()

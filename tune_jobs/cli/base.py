@@ -16,6 +16,7 @@ import click
 
 from policies.errors import CannotRunError, TuneJobsError, said_by
 from tune_jobs.cli.completion import complete_folders, complete_sources, complete_sweeps
+from tune_jobs.process import own_files
 from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ _UNCHANGED = {
     "extend": "No trial had begun, and nothing was changed: `tune-jobs extend SWEEP` adds to it.",
     "inject": "No trial had begun, and nothing was changed.",
 }
+_GOES_ON = "What is done is kept; `tune-jobs resume SWEEP` continues it."
 _JSON, _JSON_NAMED, DEBUG = "tune_jobs.json", "tune_jobs.json_named", "tune_jobs.debug"
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -76,12 +78,7 @@ class CommandGroup(click.Group):
                 _print_error(ctx, said, "Free space on its disk, or send the output elsewhere.", _CANNOT_PRINT)
                 ctx.exit(_CANNOT_PRINT)
             message = f"Unexpected {type(error).__name__}: {said_by(error)}"
-            if ctx.meta.get(DEBUG):
-                traceback.print_exc()
-                hint = ""
-            else:
-                hint = f"This is a bug in tune-jobs. The traceback is in {_save_traceback()}; --debug prints it."
-            _print_error(ctx, message, hint, TuneJobsError.exit_code)
+            _print_error(ctx, message, _hint_on_unexpected(ctx), TuneJobsError.exit_code)
             ctx.exit(TuneJobsError.exit_code)
 
     def _placed(self, error: click.ClickException, command: str | None) -> click.ClickException:
@@ -98,7 +95,20 @@ def _hint_after(interruption: KeyboardInterrupt, command: str) -> str:
     # Of a repetition nothing is kept that could be resumed.
     if isinstance(interruption, SweepInterrupted) or command == "reproduce":
         return _UNCHANGED[command]
-    return "What is done is kept; `tune-jobs resume SWEEP` continues it." if command in _UNCHANGED else ""
+    return _GOES_ON if command in _UNCHANGED else ""
+
+
+def _hint_on_unexpected(ctx: click.Context) -> str:
+    command = ctx.invoked_subcommand or ""
+    # What is loaded and what is imported after an upgrade need not fit.
+    why = "This is a bug in tune-jobs."
+    if is_changed := own_files.were_changed():
+        go_on = _GOES_ON if command in _UNCHANGED and command != "reproduce" else "Run the command again."
+        why = f"Files of tune-jobs were changed while this ran, as by an upgrade. {go_on}"
+    if ctx.meta.get(DEBUG):
+        traceback.print_exc()
+        return why if is_changed else ""
+    return f"{why} The traceback is {_keep_traceback()}"
 
 
 def _print_error(ctx: click.Context, message: str, hint: str, exit_code: int) -> None:
@@ -119,12 +129,18 @@ def _print_json_error(message: str, hint: str, exit_code: int) -> None:
     print_json({"error": message, "hint": hint, "exit_code": exit_code})
 
 
-def _save_traceback() -> str:
-    with tempfile.NamedTemporaryFile(
-        "w", prefix="tune-jobs-error-", suffix=".txt", delete=False, encoding="utf-8"
-    ) as file:
-        traceback.print_exc(file=file)
-    return file.name
+def _keep_traceback() -> str:
+    """Write the traceback to a temporary file, or print it where none can be written; return where it is."""
+    said = traceback.format_exc()
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="tune-jobs-error-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            file.write(said)
+    except OSError as error:
+        click.echo(said, err=True)
+        return f"above, as no temporary file can be written: {error.strerror}."
+    return f"in {file.name}; --debug prints it."
 
 
 def _remember_json(ctx: click.Context, _: click.Parameter, value: bool) -> bool:  # noqa: FBT001 - click's signature

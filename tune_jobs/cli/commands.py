@@ -378,6 +378,7 @@ def schema(*, as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON either 
 
 def main() -> None:
     """Entry point of the `tune-jobs` script."""
+    from tune_jobs.cli.characters import spell_missing_characters
     from tune_jobs.process.home import name_a_home
     from tune_jobs.process.interruption import end_in_order
 
@@ -388,6 +389,7 @@ def main() -> None:
     name_a_home()
     try:
         with standard_streams():
+            spell_missing_characters()
             cli(prog_name="tune-jobs")
     finally:
         # Python looks through all that is left for garbage when it ends, which took a launch 0.7 s of waiting.

@@ -16,6 +16,7 @@ import click
 
 from analysis.wording import PLAIN_NONE, counted, difference_text, range_text, return_text, setting_text
 from policies.errors import TuneJobsError, fit
+from tune_jobs.cli.characters import has_all_characters
 from tune_jobs.process.interruption import last_words
 from tune_jobs.sweeps.plain import to_json
 
@@ -42,7 +43,7 @@ STATUS_ORDER: tuple[TrialStatus, ...] = ("completed", "stopped", "failed", "runn
 
 def print_json(value: Any) -> None:
     """Print one JSON document on standard output."""
-    text = json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(to_json(value), indent=2, allow_nan=False, ensure_ascii=not has_all_characters())
     # What JSON leaves as it is, though some terminals obey it; in a document it can only be in a string.
     click.echo(_CONTROLS.sub(lambda found: f"\\u{ord(found.group()):04x}", text))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from policies.errors import NotFoundError, SpecError
+from policies.files import is_output_folder
 from tune_jobs.client import Client, ConflictError
 from tune_jobs.sweeps.outcome import Film
 
@@ -130,17 +131,23 @@ class RemoteVerbs:
 
         Raises:
             SpecError: The sweep is wrong, or not allowed there.
-            CannotRunError: It cannot run there.
+            CannotRunError: It cannot run there, or the service is of another version.
         """
         from tune_jobs.plan.machine import Machine
         from tune_jobs.plan.sweep_plan import SweepPlan
+        from tune_jobs.spec.problems import WrongSpecError
         from tune_jobs.spec.sweep_spec import SweepSpec
 
         try:
             found = self._client.plan(source, overrides=overrides, name=name)
         except SpecError as error:
             raise told_here(error, source, overrides) from error
-        spec, plan = SweepSpec.model_validate(found.spec), SweepPlan.from_json(found.plan)
+        try:
+            spec, plan = SweepSpec.model_validate(found.spec), SweepPlan.from_json(found.plan)
+        except WrongSpecError as error:
+            # The service has taken the sweep: nothing is wrong with the user's file.
+            path, text = error.problems[0]
+            raise self._client.unknown(f"{path}: {text.removesuffix('.')}") from error
         if plan.machine.source == Machine(1).source:
             plan = dataclasses.replace(plan, machine=dataclasses.replace(plan.machine, source="the service's machine"))
         return spec if name is None else spec.model_copy(update={"name": name}), plan
@@ -161,7 +168,7 @@ def told_here(error: SpecError, source: str, overrides: Sequence[str]) -> SpecEr
 def _is_folder(output: str) -> bool:
     from tune_jobs.sweeps.storage import local_path
 
-    return output.endswith("/") or local_path(output).is_dir()
+    return output.endswith("/") or is_output_folder(local_path(output))
 
 
 def _target(output: str | None, default: str) -> Path:

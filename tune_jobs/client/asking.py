@@ -70,10 +70,14 @@ class Asking:
         except ValidationError as error:
             wrong = error.errors()[0]
             where = ".".join(str(part) for part in wrong["loc"])
-            raise CannotRunError(
-                f"The service at {self.url} answers what this tune-jobs does not know: {where}: {wrong['msg']}.",
-                "It is of another version: update the older one of the two.",
-            ) from error
+            raise self.unknown(f"{where}: {wrong['msg']}") from error
+
+    def unknown(self, what: str) -> CannotRunError:
+        """Return the error for an answer that another version of tune-jobs gave."""
+        return CannotRunError(
+            f"The service at {self.url} answers what this tune-jobs does not know: {what}.",
+            "It is of another version: update the older one of the two.",
+        )
 
 
 def sweep_path(name: str) -> str:

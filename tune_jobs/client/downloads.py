@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from policies.errors import CannotRunError
-from policies.files import atomic_path
+from policies.files import atomic_path, is_output_folder
 from tune_jobs.client.connection import Connection
 from tune_jobs.client.problems import LostConnectionError, NoServiceError
 
@@ -33,7 +33,7 @@ def download(connection: Connection, path: str, to: Path) -> Path:
         NotFoundError: There is no such file.
         CannotRunError: It can't be written here, or the connection is lost again and again.
     """
-    if to.is_dir():
+    if is_output_folder(to):
         raise CannotRunError(f"{to} is a folder, not a file.", "Name a file.")
     with contextlib.ExitStack() as stack:
 

@@ -24,15 +24,17 @@ def request_of(source: Source, overrides: Sequence[str], name: str | None) -> di
     Raises:
         SpecError: There is no such file or preset, it can't be read, a value is none that JSON can hold, or an
             argument is of another kind.
+        CheckpointError: It cannot be found out whether there is a file of a preset's name.
     """
     from tune_jobs.spec.file import preset_names, read_sweep_file
     from tune_jobs.spec.plain_data import to_plain
+    from tune_jobs.store.presence import is_file
 
     source = fit_argument("source", source, Source)
     request = plain_values(overrides=listed("overrides", overrides), name=name)
     if isinstance(source, Mapping):
         return request | {"spec": to_plain(source, "sweep")}
-    if not Path(source).is_file() and str(source) in preset_names():
+    if str(source) in preset_names() and not is_file(Path(source)):
         return request | {"preset": str(source)}
     _, text = read_sweep_file(source)
     return request | {"text": text, "default_name": Path(source).stem}

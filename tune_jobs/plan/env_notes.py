@@ -39,7 +39,13 @@ def env_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None = None) -> l
     """Return notes on a sweep's environment, with its wrappers; `packs`, if some are planned, say what was measured."""
     step_us = None if packs is None else packs.env_step_us
     sizes = size_notes(spec, env, packs)
-    return [*_on_observations(spec, env), *sizes, *_on_actions(env), *_on_episodes(spec, env, step_us)]
+    return [
+        *_on_observations(spec, env),
+        *sizes,
+        *_on_actions(env),
+        *_on_episodes(spec, env, step_us),
+        *_on_goals(spec, env),
+    ]
 
 
 def _on_observations(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
@@ -103,12 +109,28 @@ def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterat
             f"env.args.max_episode_steps {asked:,} never acts: {env.env_id} cuts off episodes after "
             f"{env.max_episode_steps:,} env steps by itself. {where}"
         )
-    target = spec.stop.training_return
-    if env.threshold is not None and target is not None and target < env.threshold:
-        yield (
-            f"stop.training_return {target:g} is below {env.env_id}'s threshold {env.threshold:g}: "
-            "trials may end before they solve it."
-        )
+
+
+def _on_goals(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
+    """Yield what is to be told of goals at which trials end before the return that they are judged by."""
+    is_judged_by_it = spec.objective.type == "steps_to_threshold" and not spec.scheduler.is_population
+    goal, whose = env.threshold, f"{env.env_id}'s threshold"
+    if is_judged_by_it and spec.objective.threshold is not None:
+        goal, whose = spec.objective.threshold, "objective.threshold"
+    for name, target in (
+        ("training_return", spec.stop.training_return), ("evaluation_return", spec.stop.evaluation_return)
+    ):  # fmt: skip
+        if goal is None or target is None or target >= goal:
+            continue
+        below = f"stop.{name} {target:g} is below {whose} {goal:g}"
+        if is_judged_by_it:
+            yield (
+                f"{below}, and objective.type is steps_to_threshold: a trial that ends there without an evaluation of "
+                f"{goal:g} counts as one that never reached it. Raise stop.{name} or leave it out, or set "
+                f"objective.threshold to {target:g}."
+            )
+        elif name == "training_return":
+            yield f"{below}: trials may end before they solve it."
 
 
 def _note_on_image(spec: SweepSpec, env: EnvInfo, vectors: FlatBox) -> str | None:

@@ -17,6 +17,7 @@ from policies.portable.convolution import output_shape
 
 if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
+    from tune_jobs.spec.sections import StopSpec
     from tune_jobs.spec.sweep_spec import SweepSpec
 
 # The sizes of an RLlib checkpoint without its weights, and of a line of results with its TensorBoard scalars; they
@@ -34,8 +35,13 @@ _NUMBERS_PER_STEP = 12
 
 def max_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
     """Return the most env steps of one trial, which ends with the iteration in which it reaches its cap."""
-    iteration = _most_of_an_iteration(spec, values)
-    return min(spec.stop.num_env_steps - 1 + iteration, spec.stop.num_iterations * iteration)
+    return most_env_steps_until(spec.stop, values, spec.resources.num_env_runners)
+
+
+def most_env_steps_until(stop: StopSpec, values: Hyperparams, num_env_runners: int) -> int:
+    """Return the most env steps of a trial with these rules of when it ends; see `max_env_steps`."""
+    iteration = _most_of_an_iteration(values, max(1, num_env_runners))
+    return min(stop.num_env_steps - 1 + iteration, stop.num_iterations * iteration)
 
 
 def planned_env_steps(spec: SweepSpec, values: Hyperparams) -> int:
@@ -48,9 +54,9 @@ def max_iterations(spec: SweepSpec, values: Hyperparams) -> int:
     return min(spec.stop.num_iterations, math.ceil(spec.stop.num_env_steps / iteration_env_steps(values)))
 
 
-def _most_of_an_iteration(spec: SweepSpec, values: Hyperparams) -> int:
+def _most_of_an_iteration(values: Hyperparams, num_runners: int) -> int:
     """Return the most env steps of one iteration; all sub-environments step together, so the last step overshoots."""
-    wanted, num_runners = iteration_env_steps(values), max(1, spec.resources.num_env_runners)
+    wanted = iteration_env_steps(values)
     if isinstance(values, DQNHyperparams):
         # An iteration ends with a sampling phase, in which each env runner makes its share of train_freq.
         return wanted - 1 + num_runners * (math.ceil(values.train_freq / num_runners) - 1 + values.num_envs)
@@ -67,13 +73,20 @@ def max_disk_bytes(spec: SweepSpec, env: EnvInfo, values: Hyperparams) -> int:
     """Estimate the most bytes that one trial's folder holds."""
     iterations = max_iterations(spec, values)
     checkpoint = _CHECKPOINT_BASE_BYTES + _num_weights(env, values) * _BYTES_PER_NUMBER * _COPIES_OF_WEIGHTS
-    kept = min(spec.checkpoints.keep + 2, math.ceil(iterations / spec.checkpoints.every_iterations) + 2)
+    # The newest and the best; and in a population a copy of another trial's.
+    kept = min(max(1, spec.checkpoints.keep) + 1, iterations) + spec.scheduler.is_population
     # There is one checkpoint more while a new one is written and the old one is not yet deleted.
     return (kept + 1) * checkpoint + iterations * _ITERATION_BYTES
 
 
-def trial_bytes(env: EnvInfo, values: Hyperparams) -> int:
-    """Estimate the memory of one trial, in bytes: weights, train batch and replay memory, without its process's own."""
+def trial_bytes(env: EnvInfo, values: Hyperparams, num_env_steps: int | None = None) -> int:
+    """Estimate the memory of one trial, in bytes: weights, train batch and replay memory, without its process's own.
+
+    Args:
+        env: Its environment.
+        values: Its hyperparameters.
+        num_env_steps: Its most env steps, of which a replay memory holds no more transitions; None: any number.
+    """
     # Images stay bytes.
     itemsize = np.dtype(observation_dtype(env.observation_space)).itemsize
     observation = math.prod(env.observation_space.shape or ()) * itemsize
@@ -87,10 +100,11 @@ def trial_bytes(env: EnvInfo, values: Hyperparams) -> int:
         # The observations before and after, the action (8 bytes), reward and discount.
         transition = 2 * observation + 4 * _BYTES_PER_NUMBER
         total += values.train_batch_size * (_COPIES_OF_BATCH * transition + hidden + windows)
-        total += (0 if values.replay == "none" else values.replay_capacity) * transition
+        held = values.replay_capacity if num_env_steps is None else min(values.replay_capacity, num_env_steps)
+        total += (0 if values.replay == "none" else held) * transition
         if values.replay == "prioritized":
             # A tree of sums, two nodes of 8 bytes per transition, whose number is rounded up to a power of 2.
-            total += 16 * (1 << (values.replay_capacity - 1).bit_length())
+            total += 16 * (1 << (held - 1).bit_length())
     return total
 
 

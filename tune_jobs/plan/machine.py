@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
+import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from tune_jobs.process.torch_build import uses_gpus
 
 _CGROUPS = Path("/sys/fs/cgroup")
+_OWN_CGROUPS = Path("/proc/self/cgroup")
 _MEMORY_INFO = Path("/proc/meminfo")
+_GPUS = Path("/proc/driver/nvidia/gpus")
+# A driver that is about to hang must not keep a plan waiting.
+_GPUS_TOLD_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -25,10 +32,17 @@ class Machine:
     memory_bytes: float | None = None
     """Available memory, in bytes; None: not known. On a cluster, every CPU counts with the memory per CPU of the node
     that has the least."""
+    in_cgroup: bool = False
+    """Whether the memory is what the limit of a cgroup leaves: that of a batch job, of a service or of a container."""
     unusable_gpus: float = 0.0
     """GPUs that are there, and not counted: PyTorch is a build for CPUs alone."""
     more: str = "launch on a larger cluster with --address"
     """How to get more resources, for hints."""
+
+    @property
+    def has_available(self) -> str:
+        """Whose memory it is, for notes: that it "has available"."""
+        return f"{self.source} has available" + " within its cgroup's memory limit" * self.in_cgroup
 
     def fitting(self, cpus: float, gpus: float) -> float:
         """Return how many processes with these CPUs and GPUs fit at once, each on one node; infinite if both are 0."""
@@ -56,13 +70,21 @@ class Machine:
 
 
 def local_machine() -> Machine:
-    """Return what this process may use: CPUs and memory within affinity and container limits, and visible GPUs.
+    """Return what this process may use: CPUs and memory within affinity and its cgroup's limits, and visible GPUs.
 
     GPUs count if PyTorch can use them.
     """
     gpus = _visible_gpus()
     unusable = gpus if gpus and not uses_gpus() else 0.0
-    return Machine(usable_cpus(), gpus - unusable, unusable_gpus=unusable, memory_bytes=_usable_memory())
+    available, left = _available_memory(_MEMORY_INFO), _cgroup_memory(_CGROUPS)
+    in_cgroup = left is not None and (available is None or left < available)
+    return Machine(
+        usable_cpus(),
+        gpus - unusable,
+        unusable_gpus=unusable,
+        memory_bytes=left if in_cgroup else available,
+        in_cgroup=in_cgroup,
+    )
 
 
 def _times(available: float, wanted: float) -> int:
@@ -78,16 +100,51 @@ def usable_cpus() -> float:
     return float(affinity if quota is None else max(1, min(affinity, math.ceil(quota))))
 
 
-def _cgroup_quota(root: Path) -> float | None:
-    """Return the CPUs that a container may use by its cgroup (v2, then v1), or None if it isn't limited."""
+def _cgroups(root: Path, controller: str, own: Path) -> Iterator[Path]:
+    """Yield the folders of the cgroups that a controller may limit this process by: its own, and all above it.
+
+    A batch system and systemd set limits to a cgroup of their own, far below the root. Where a container sees only its
+    part of the tree, its path is not there, and the root is its cgroup: not every folder exists.
+
+    Args:
+        root: Where cgroups are mounted: those of v2, or a folder for each controller of v1.
+        controller: Its name.
+        own: The file with the paths of this process.
+    """
+    paths = {root: "/", root / controller: "/"}
     try:
-        quota, period = (root / "cpu.max").read_text(encoding="ascii").split()
+        lines = own.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        _, _, names_and_path = line.partition(":")
+        names, _, path = names_and_path.partition(":")
+        # One above the root of its namespace has a path with "..", which leads out of the tree.
+        if ".." not in path.split("/"):
+            if not names:
+                paths[root] = path
+            elif controller in names.split(","):
+                paths[root / controller] = path
+    for mount, path in paths.items():
+        inner = PurePosixPath(path.lstrip("/"))
+        yield from (mount / each for each in (inner, *inner.parents))
+
+
+def _cgroup_quota(root: Path, own: Path = _OWN_CGROUPS) -> float | None:
+    """Return the CPUs that this process may use by its cgroups (v2 and v1), or None if they aren't limited."""
+    found = [_quota_of(folder) for folder in _cgroups(root, "cpu", own)]
+    return min((quota for quota in found if quota is not None), default=None)
+
+
+def _quota_of(folder: Path) -> float | None:
+    try:
+        quota, period = (folder / "cpu.max").read_text(encoding="ascii").split()
         return None if quota == "max" else int(quota) / int(period)
-    except (OSError, ValueError):
+    except (OSError, ValueError, ZeroDivisionError):
         pass
     try:
-        micros = int((root / "cpu/cpu.cfs_quota_us").read_text(encoding="ascii"))
-        return None if micros < 0 else micros / int((root / "cpu/cpu.cfs_period_us").read_text(encoding="ascii"))
+        micros = int((folder / "cpu.cfs_quota_us").read_text(encoding="ascii"))
+        return None if micros < 0 else micros / int((folder / "cpu.cfs_period_us").read_text(encoding="ascii"))
     except (OSError, ValueError, ZeroDivisionError):
         return None
 
@@ -95,14 +152,27 @@ def _cgroup_quota(root: Path) -> float | None:
 def _visible_gpus() -> float:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
-        return float(len([name for name in visible.split(",") if name.strip() not in ("", "-1")]))
-    return float(len(list(Path("/proc/driver/nvidia/gpus").glob("*"))))
+        # "NoDevFiles" is what Slurm gives to a job that has no GPU.
+        return float(len([name for name in visible.split(",") if name.strip() not in ("", "-1", "NoDevFiles")]))
+    if _GPUS.is_dir():
+        return float(len(list(_GPUS.glob("*"))))
+    return _listed_gpus()
 
 
-def _usable_memory() -> float | None:
-    """Return the bytes that are available here, or None if the system does not say."""
-    known = [bytes_ for bytes_ in (_available_memory(_MEMORY_INFO), _cgroup_memory(_CGROUPS)) if bytes_ is not None]
-    return min(known, default=None)
+@functools.cache
+def _listed_gpus() -> float:
+    """Return the GPUs that NVIDIA's tool lists: within WSL2 the driver is that of Windows, and not in /proc."""
+    try:
+        told = subprocess.run(
+            ["nvidia-smi", "-L"],  # noqa: S607 (where it is depends on the system)
+            capture_output=True,
+            timeout=_GPUS_TOLD_WITHIN_S,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return 0.0
+    # Parts of a GPU (MIG) have lines of their own, which are indented.
+    return float(sum(line.startswith(b"GPU ") for line in told.stdout.splitlines()))
 
 
 def _available_memory(path: Path) -> float | None:
@@ -114,16 +184,22 @@ def _available_memory(path: Path) -> float | None:
         return None
 
 
-def _cgroup_memory(root: Path) -> float | None:
-    """Return what a container's memory limit (cgroup v2, then v1) leaves, or None without one; file caches are free."""
+def _cgroup_memory(root: Path, own: Path = _OWN_CGROUPS) -> float | None:
+    """Return what the memory limits of this process's cgroups (v2 and v1) leave, or None without one."""
+    found = [_memory_left_of(folder) for folder in _cgroups(root, "memory", own)]
+    return min((left for left in found if left is not None), default=None)
+
+
+def _memory_left_of(folder: Path) -> float | None:
+    """Return what a cgroup's limit leaves; file caches are free."""
     for limit, usage, files in (
         ("memory.max", "memory.current", "inactive_file"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
         try:
-            most = float(int((root / limit).read_text(encoding="ascii")))
-            used = int((root / usage).read_text(encoding="ascii"))
-            counts = (root / usage).with_name("memory.stat").read_text(encoding="ascii").split()
+            most = float(int((folder / limit).read_text(encoding="ascii")))
+            used = int((folder / usage).read_text(encoding="ascii"))
+            counts = (folder / "memory.stat").read_text(encoding="ascii").split()
             return max(0.0, most - used + int(counts[counts.index(files) + 1]))
         except (OSError, ValueError):
             continue

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import gymnasium as gym
 from pydantic import TypeAdapter
@@ -51,7 +51,7 @@ from tune_jobs.spec.engines import engine_named
 from tune_jobs.spec.hyperparam_problems import check_distinct
 from tune_jobs.spec.rules import idle_settings
 from tune_jobs.spec.seeds import confirmation_seeds, evaluation_seeds, trial_seeds
-from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.sweep_spec import SweepSpec, check_trainable
 from tune_jobs.spec.training_length import as_trained
 
 NUM_CONFIRMATION_EPISODES = 100
@@ -62,6 +62,7 @@ _SWEEP_BYTES = 20_000_000
 
 _Point = tuple[dict[str, Any] | None, Hyperparams | None]
 """The sampled values and all hyperparameters; both are None if the search method chooses them at the trial's start."""
+_Own = TypeVar("_Own")
 
 
 @dataclass(frozen=True)
@@ -203,12 +204,21 @@ def make_plan(
     idle = idle_notes(spec, env, [values for _, values in points], are_packed, searched, may_refuse=not records)
     sizes = _sizes(spec, points, known)
     to_run = _to_run(trials, records, retry_failed=retry_failed)
-    memory = _largest(sizes, specs, lambda _, each: trial_bytes(env, each))
+    if to_run:
+        check_trainable(spec)
+    lengths = _largest(sizes, specs, max_env_steps)
+    memory = _largest(sizes, lengths, lambda most_steps, each: trial_bytes(env, each, most_steps))
     members = _members(to_run, points, memory)
-    alone = max((memory[trial.point_index] for trial in to_run if not _is_packed(trial)), default=0)
+    alone = [memory[trial.point_index] for trial in to_run if not _is_packed(trial)]
     cpus, waits, most = spec.cpus_per_trial, spec.scheduler.waits_for_others, concurrent
     concurrent, memory_notes = lowered_by_memory(
-        machine, alone, concurrent, cpus=float(cpus), algorithm=spec.algorithm, by_cpus=waits
+        machine,
+        max(alone, default=0),
+        concurrent,
+        cpus=float(cpus),
+        algorithm=spec.algorithm,
+        num_processes=1 + spec.resources.num_env_runners if alone else 0,
+        by_cpus=waits,
     )
     cpus = max(cpus, cpus_that_hold(machine, concurrent)) if waits and concurrent < most else cpus
     at_once = concurrent
@@ -216,7 +226,6 @@ def make_plan(
     if packs is not None:
         all_are_packed = all(map(_is_packed, trials))
         concurrent = packs.max_concurrent if all_are_packed else max(packs.max_concurrent, concurrent)
-    lengths = _largest(sizes, specs, max_env_steps)
     return SweepPlan(
         trials=trials,
         num_points=len(points),
@@ -363,11 +372,11 @@ def _total(trials: Sequence[TrialPlan], of_points: Sequence[int]) -> int:
 
 
 def _largest(
-    sizes: list[list[Hyperparams]], specs: Sequence[SweepSpec], measure: Callable[[SweepSpec, Hyperparams], int]
+    sizes: list[list[Hyperparams]], of_points: Sequence[_Own], measure: Callable[[_Own, Hyperparams], int]
 ) -> list[int]:
     """Return the largest measure for each point; a list that is shared by many points is measured once."""
     known: dict[int, int] = {}
-    for values, own in zip(sizes, specs, strict=True):
+    for values, own in zip(sizes, of_points, strict=True):
         if id(values) not in known:
             known[id(values)] = max(measure(own, each) for each in values)
     return [known[id(values)] for values in sizes]

@@ -111,7 +111,7 @@ def _places(spec: ModuleSpec) -> Sequence[str]:
 def _their_specs(name: str) -> Iterator[ModuleSpec]:
     """Yield the user's own packages and modules of a name, in the present order of the path."""
     for entry in sys.path:
-        spec = PathFinder.find_spec(name, [entry or os.getcwd()])  # noqa: PTH109
+        spec = PathFinder.find_spec(name, [entry])
         if spec is not None and not _is_ours(spec, name):
             yield spec
     # A project in an editable installation may have a finder of its own.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -87,10 +88,16 @@ def named_cluster() -> str | None:
     return None if address == "auto" else address or None
 
 
+def rays_folder() -> Path:
+    """Return the folder where a Ray that is started on this machine has its sockets and logs."""
+    # As Ray 2.60 finds it (ray._common.utils.get_default_ray_temp_dir), without importing ray.
+    its_own = os.environ.get("TMPDIR") if sys.platform == "linux" else None
+    return Path(os.environ.get("RAY_TMPDIR") or its_own or "/tmp", "ray")  # noqa: S108 (Ray's own default)
+
+
 def _record_path() -> Path:
-    # The file where Ray 2.60 keeps it (ray._common.utils.get_ray_address_file), found without importing ray.
-    folder = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"  # noqa: S108 (Ray's own default)
-    return Path(folder, "ray", "ray_current_cluster")
+    # The file where Ray 2.60 keeps it (ray._common.utils.get_ray_address_file).
+    return rays_folder() / "ray_current_cluster"
 
 
 def _find_cluster() -> tuple[str, str]:

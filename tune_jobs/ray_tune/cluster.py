@@ -33,7 +33,7 @@ from tune_jobs.ray_tune.connected_ray import (
 )
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.forks import ForkServer, fork_server
-from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, start, without_environments
+from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, outside_of_uv, start, without_environments
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
 
@@ -168,7 +168,7 @@ def _join(address: str) -> None:
     # Ray's native code prints a warning for each of its attempts.
     with tempfile.NamedTemporaryFile(prefix="tune-jobs-join-") as file:
         try:
-            with quiet(Path(file.name)):
+            with quiet(Path(file.name)), outside_of_uv():
                 _init_patiently(address)
         except Exception as error:
             said = Path(file.name).read_text(encoding="utf-8", errors="replace")

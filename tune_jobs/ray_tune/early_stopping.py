@@ -17,6 +17,7 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import ASHAScheduler, MedianStoppingRule, TrialScheduler
 
 from tune_jobs.ray_tune.hyperband import HyperBand, HyperBandScheduler
+from tune_jobs.ray_tune.median_stopping import MedianStopping
 from tune_jobs.ray_tune.scheduling import Decision, EveryoneGoesOn, Others, Scheduler, Standing, is_unscored
 from tune_jobs.ray_tune.tune_scheduler import METRIC, TuneScheduler
 from tune_jobs.spec.scheduler import SchedulerSpec
@@ -49,7 +50,7 @@ _DECISIONS = {
 
 
 class RayRule:
-    """A `Scheduler` by one of Ray's rules that look at one trial at a time; no private member of Ray is used.
+    """A `Scheduler` by one of Ray's rules that look at one trial at a time; of them it uses no private member.
 
     A trial whose evaluation is not a finite number is ended at its first evaluation after the grace period. That it
     loses every comparison is not enough, because the first trial to reach a rung is compared with none.
@@ -118,7 +119,7 @@ def build_scheduler(spec: SchedulerSpec, max_env_steps: int) -> Scheduler:
         return RayRule(asha, grace)
     if spec.type == "median":
         # Golovin et al. 2017.
-        return RayRule(MedianStoppingRule(grace_period=grace, **common), grace)
+        return RayRule(MedianStopping(grace_period=grace, **common), grace)
     if spec.type == "none":
         return EveryoneGoesOn()
     raise ValueError(f"Trials wait for each other with {spec.type}, which is no scheduler of this kind.")

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
@@ -20,6 +22,7 @@ import ray
 from policies.envs.modules import module_folders
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
+from tune_jobs.ray_tune.address import rays_folder
 from tune_jobs.ray_tune.environment import provide_token
 from tune_jobs.ray_tune.forking import forked_workers
 from tune_jobs.ray_tune.forks import ForkServer
@@ -27,6 +30,9 @@ from tune_jobs.ray_tune.replaced import replaced
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
+# Where less is left, Ray itself refuses to start, and says so.
+_LEAST_BYTES = 100e6
+_PATH_TOO_LONG = "AF_UNIX path length"
 # Ray 2.60's processes ask a second later where a socket is not there yet, which the raylet's own may not be.
 _SYSTEM = {"raylet_client_connect_timeout_milliseconds": 20, "raylet_client_num_connect_attempts": 500}
 QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
@@ -47,20 +53,27 @@ def start(
     Raises:
         CannotRunError: Ray does not start.
     """
+    _check_paths()
     # A local sweep sends nothing anywhere; users who want Ray's usage statistics can set the variable.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     provide_token()
     resources: dict[str, Any] = {}
     if machine is not None:
         resources = {"num_cpus": int(machine.num_cpus), "num_gpus": int(machine.num_gpus)}
+        left = (machine.memory_bytes or 0.0) - _OBJECT_STORE_BYTES
+        if left >= _LEAST_BYTES:
+            # Plans for this Ray read it there again, and Ray 2.60 sees no cgroup's limit but the root's.
+            resources["_memory"] = int(left)
     try:
         with (
             _finding_own_modules(),
             _without_unused_processes(),
             without_dashboards_agent(),
+            with_python_quoted(),
             forked_workers(forks),
             _noticing_its_node(meanwhile),
             at_loopback(),
+            outside_of_uv(),
         ):
             # "local": a cluster of this sweep's own, even if another one runs already.
             ray.init(
@@ -72,10 +85,30 @@ def start(
                 **QUIET,
             )
     except Exception as error:
-        raise CannotRunError(
-            f"Ray cannot be started on this machine: {first_line(error)}",
-            "Look for the cause in Ray's logs in /tmp/ray/session_latest/logs.",
-        ) from error
+        folder = rays_folder()
+        if _PATH_TOO_LONG in str(error):
+            hint = f"{folder} is too long a path for Ray's sockets: set RAY_TMPDIR to a short folder, such as /tmp."
+        else:
+            hint = f"Look for the cause in Ray's logs in {folder / 'session_latest' / 'logs'}."
+        raise CannotRunError(f"Ray cannot be started on this machine: {first_line(error)}", hint) from error
+
+
+def _check_paths() -> None:
+    """Refuse an installation whose path a raylet (Ray 2.60) reads as another one; it would wait for nothing, and end.
+
+    Raises:
+        CannotRunError: It is one.
+    """
+    for path in (sys.executable, __file__, ray.__file__):
+        try:
+            is_read = shlex.split(subprocess.list2cmdline([path])) == [path]
+        except ValueError:  # a quote that nothing ends
+            is_read = False
+        if not is_read:
+            raise CannotRunError(
+                f"Ray cannot be started from {path}: it finds no file whose path has a quote or a backslash.",
+                "Install tune-jobs in a folder without them, as in a new virtual environment there.",
+            )
 
 
 @contextlib.contextmanager
@@ -87,6 +120,24 @@ def at_loopback() -> Iterator[None]:
     such a Ray has to do so too.
     """
     with replaced(ray._private.ray_constants, "ENABLE_RAY_CLUSTER", value=False):  # noqa: SLF001
+        yield
+
+
+_UV = "RAY_ENABLE_UV_RUN_RUNTIME_ENV"
+
+
+@contextlib.contextmanager
+def outside_of_uv() -> Iterator[None]:
+    """Let the processes of a Ray that is joined in the block run in the Python of their machine, under `uv run` too.
+
+    Where `uv run` is above this process, Ray 2.60 starts each of them by `uv run`, in a copy of the working directory,
+    sweeps and all: uv makes an environment anew there, and nothing is forked. In a subfolder of a project Ray does not
+    start. Users who want that can set the variable.
+    """
+    if _UV in os.environ:
+        yield
+        return
+    with replaced(ray._private.ray_constants, _UV, value=False):  # noqa: SLF001
         yield
 
 
@@ -138,6 +189,8 @@ def _without_unused_processes() -> Iterator[None]:
 
 
 _AGENT = "--dashboard_agent_command="
+# The quote is there where the path has a space.
+_AGENTS_PROGRAM = re.compile(r'/agent\.py"? ')
 
 
 @contextlib.contextmanager
@@ -149,9 +202,19 @@ def without_dashboards_agent() -> Iterator[None]:
     """
     services: Any = ray._private.services  # noqa: SLF001
     original = services.start_ray_process
+    error_of_agent = ray._private.utils.get_dashboard_dependency_error  # noqa: SLF001
+
+    def replacing(part: str) -> str:
+        if not part.startswith(_AGENT):
+            return part
+        replaced_by = _of_an_idle_agent(part)
+        if replaced_by is None:
+            # Ray's own agent ends without it, where what it needs is missing, and the raylet with it.
+            return part if error_of_agent() is None else f"{part} --minimal"
+        return replaced_by
 
     def start(command: list[str], *args: Any, **kwargs: Any) -> Any:
-        return original([_of_an_idle_agent(part) for part in command], *args, **kwargs)
+        return original([replacing(part) for part in command], *args, **kwargs)
 
     def no_error() -> None:
         return None
@@ -163,15 +226,28 @@ def without_dashboards_agent() -> Iterator[None]:
         yield
 
 
-def _of_an_idle_agent(part: str) -> str:
-    """A part of a raylet's command; the command of the dashboard's agent, in one part, with another program."""
-    if not part.startswith(_AGENT):
-        return part
-    _, found, options = part.partition(f"{os.sep}agent.py ")
-    if not found or sys.platform == "win32":
-        return part
+def _of_an_idle_agent(part: str) -> str | None:
+    """The command of the dashboard's agent, a part of a raylet's command, with another program; None: it is another."""
+    found = _AGENTS_PROGRAM.search(part)
+    if found is None:
+        return None
     program = [sys.executable, "-I", "-S", str(Path(__file__).with_name("idle_agent.py"))]
-    return f"{_AGENT}{subprocess.list2cmdline(program)} {options}"
+    return f"{_AGENT}{subprocess.list2cmdline(program)} {part[found.end() :]}"
+
+
+@contextlib.contextmanager
+def with_python_quoted() -> Iterator[None]:
+    """Let a Ray that is started in the block start its processes also where Python's path has a space, say.
+
+    Ray 2.60 gives it to a shell as it is; see `setup_worker`.
+    """
+    if shlex.quote(sys.executable) == sys.executable:
+        yield
+        return
+    # Ray takes it for a file in a folder of its own: a whole path leads out of there.
+    program = str(Path(__file__).with_name("setup_worker.py"))
+    with replaced(ray._private.ray_constants, "SETUP_WORKER_FILENAME", program):  # noqa: SLF001
+        yield
 
 
 @contextlib.contextmanager

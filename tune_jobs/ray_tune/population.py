@@ -30,7 +30,7 @@ from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.ray_tune.pointers import latest_iteration, pointer_to, result_of
 from tune_jobs.ray_tune.scheduling import WORST_SCORE, CopyFrom, Decision, Others, Standing
 from tune_jobs.ray_tune.tune_scheduler import OfTune, TuneScheduler, is_starting, name_of, standing_of
-from tune_jobs.search.bandit import Next, propose
+from tune_jobs.search.bandit import Gain, Next, propose
 from tune_jobs.search.comparisons import Comparison, last_over, made_together
 from tune_jobs.search.gains import Curves, Evaluations, gains_of
 from tune_jobs.search.mutation import mutate
@@ -114,6 +114,8 @@ class Population:
         """The trials that had ended when this comparison began."""
         self._chosen: dict[str, dict[str, Any]] = {}
         """The points of trials that are copied to in this comparison, which their records may not have yet."""
+        self._gains: Sequence[Gain] | None = None
+        """What is known at this comparison of what intervals have gained; None: nothing was read of it yet."""
 
     def begins(self, trial_id: str) -> None:
         """Add a trial to the population, with what it has trained already in a sweep that is resumed."""
@@ -173,7 +175,7 @@ class Population:
             if standing.num_env_steps >= member.selected_from + interval:
                 member.selected_from = standing.num_env_steps
                 selected.add(standing.trial_id)
-        self._chosen = {}
+        self._chosen, self._gains = {}, None
         self._ended = others.ended()
         ranking = self._ranking()
         return {
@@ -226,8 +228,10 @@ class Population:
         others = [name for name in self._members if name != standing.trial_id and name not in self._ended]
         meanwhile = [self._chosen.get(name) or self._read(name).point for name in others]
         coming = Next(standing.num_env_steps / interval + 1, score, point, meanwhile)
-        records = list(map(self._read, self._members)) if self._all_records is None else self._all_records()
-        gains = gains_of(records, self._curves([record.trial_id for record in records]), interval)
+        if self._gains is None:
+            records = list(map(self._read, self._members)) if self._all_records is None else self._all_records()
+            self._gains = gains_of(records, self._curves([record.trial_id for record in records]), interval)
+        gains = self._gains
         return self._valid(point, lambda: propose(coming, space, gains, rng, resample_probability))
 
     def _valid(self, point: dict[str, Any], draw: Callable[[], dict[str, Any]]) -> dict[str, Any]:

@@ -168,8 +168,11 @@ class _Run:
     def all_trials(self) -> None:
         """Run all trials: those of the search first, then the further seeds of some of its points."""
         spec = self._spec
-        replicas = [name for name in self._job.trial_ids if self.keeper.record(name).seed_index >= spec.seeds_per_point]
-        searched = [name for name in self._job.trial_ids if name not in set(replicas)]
+        searched: list[str] = []
+        replicas: list[str] = []
+        for name in self._job.trial_ids:
+            is_replica = self.keeper.record(name).seed_index >= spec.seeds_per_point
+            (replicas if is_replica else searched).append(name)
         if searched:
             self._scheduler = self._build_scheduler()
             if spec.search.has_model:
@@ -182,8 +185,11 @@ class _Run:
 
     def _stage(self, trial_ids: Sequence[str], suffix: str) -> None:
         plan = self._job.packs
-        packed = [] if plan is None else [name for name in plan.trial_ids if name in set(trial_ids)]
-        others = [name for name in trial_ids if name not in set(packed)]
+        in_packs = [] if plan is None else plan.trial_ids
+        # Sets, as of thousands of trials each is looked up.
+        in_stage, is_packed = set(trial_ids), set(in_packs)
+        packed = [name for name in in_packs if name in in_stage]
+        others = [name for name in trial_ids if name not in is_packed]
         if packed:
             self._packs(packed, f"packs{suffix}")
         # Packs first, then single trials, because a pack uses all its CPUs all the time.

@@ -123,7 +123,7 @@ class TaskReader:
             rl_module=spec.rl_module,
             changes=trial.changes,
             in_step=spec.scheduler.waits_for_others and trial.seed_index < spec.seeds_per_point,
-            judging=judging_of(spec, self.sweep, trial.point),
+            judging=judging_of(spec, self.sweep, trial.point, trial.hyperparams),
             engine=engine_on_record(trial.engine, spec.algorithm).name,
         )
 

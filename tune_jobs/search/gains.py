@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from analysis.records import TrialRecord
 from policies.errors import CheckpointError
@@ -76,6 +77,8 @@ def gains_of(records: Sequence[TrialRecord], curves: Curves, interval: int) -> l
 
 def _of_trial(record: TrialRecord, curves: Curves, interval: int) -> list[Gain]:
     changes = {change.iteration: change for change in record.changes}
+    until = list(itertools.accumulate((change.iteration for change in record.changes), max))
+    """The last iteration that was trained with the point before each change."""
     found: list[Gain] = []
     begin: tuple[int, float] | None = None
     """Env steps and score at the interval's beginning; None: not known yet."""
@@ -86,7 +89,8 @@ def _of_trial(record: TrialRecord, curves: Curves, interval: int) -> list[Gain]:
             if begin is not None and score.num_env_steps > begin[0]:
                 steps, before = begin
                 length = (score.num_env_steps - steps) / interval
-                point = _point_until(record, score.iteration)
+                place = bisect_left(until, score.iteration)
+                point = record.changes[place].before if place < len(until) else record.point
                 time = score.num_env_steps / interval
                 found.append(Gain(time, before, (score.value - before) / length, point))
             value: float | None = score.value
@@ -100,11 +104,7 @@ def _of_trial(record: TrialRecord, curves: Curves, interval: int) -> list[Gain]:
     return found
 
 
-def _point_until(record: TrialRecord, iteration: int) -> dict[str, Any]:
-    """Return the point that an iteration was trained with."""
-    return next((change.before for change in record.changes if change.iteration >= iteration), record.point)
-
-
 def _score_at(curve: Sequence[Score], iteration: int) -> float | None:
     """Return a trial's newest score at an iteration; None: it had none."""
-    return next((score.value for score in reversed(curve) if score.iteration <= iteration), None)
+    place = bisect_right(curve, iteration, key=lambda score: score.iteration)
+    return curve[place - 1].value if place else None

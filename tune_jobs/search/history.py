@@ -130,7 +130,7 @@ def _known(
     return KnownPoint(
         point=members[0].point,
         scores=tuple(map(score, ended)),
-        env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps) for record in ended),
+        env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps, spec.stop.num_iterations) for record in ended),
         is_running=any(record.status not in FINISHED for record in members if record.seed_index < spec.seeds_per_point),
         level=_level(spec, members),
     )

@@ -88,11 +88,11 @@ def make_study(spec: SweepSpec, data: SweepData, name: str, path: Path | None = 
 
 
 def _make_file(path: Path) -> None:
-    if path.exists():
-        raise CannotRunError(
-            f"{path} exists already.", "Remove it, or give another file with --out (in Python output=)."
-        )
     try:
+        if path.exists():
+            raise CannotRunError(
+                f"{path} exists already.", "Remove it, or give another file with --out (in Python output=)."
+            )
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     except OSError as error:
@@ -123,7 +123,10 @@ def _as_optunas(
     iterations = data.results.get(trial.trial_id, ())
     score = None
     if trial.status != "failed":
-        score = score_of(trial, iterations, data.objective, num_env_steps=data.num_env_steps, threshold=data.threshold)
+        score = score_of(
+            trial, iterations, data.objective, num_env_steps=data.num_env_steps, num_iterations=data.num_iterations,
+            threshold=data.threshold,
+        )  # fmt: skip
     told: dict[str, Any] = {"state": optuna.trial.TrialState.FAIL}
     if score is not None and math.isfinite(score):
         pruned = trial.status == "stopped"

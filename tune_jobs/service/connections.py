@@ -12,9 +12,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEAD_S = 30.0
 """How long the head of a request may take to arrive, in seconds. The access layer limits bodies."""
-_MOST_FILES = 65_536
+_MOST_FILES = (65_536, 10_240)
 """As many as the systemd unit of the guide allows: programs that go through all numbers of descriptors take long where
-the system would allow a billion."""
+the system would allow a billion. Else as many as each macOS allows, which says that it sets no limit and sets one."""
 
 
 class HeadTimeoutProtocol(H11Protocol):
@@ -69,12 +69,19 @@ class HeadTimeoutProtocol(H11Protocol):
 def many_files() -> Iterator[None]:
     """Let this process have as many files and connections open in the block as the system allows it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_FILES)
-    is_raised = soft != resource.RLIM_INFINITY and soft < wanted
-    if is_raised:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    is_raised = soft != resource.RLIM_INFINITY and any(_raise_limit(soft, hard, most) for most in _MOST_FILES)
     try:
         yield
     finally:
         if is_raised:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def _raise_limit(soft: int, hard: int, most: int) -> bool:
+    wanted = most if hard == resource.RLIM_INFINITY else min(hard, most)
+    if soft >= wanted:
+        return False
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        return True
+    return False

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from policies.envs.modules import allow_modules
 from policies.errors import CannotRunError, TuneJobsError, fit, said_by
+from tune_jobs.process import own_files
 from tune_jobs.process.interruption import end_in_order
 from tune_jobs.service import logs
 from tune_jobs.service.job_files import Ended, Holder, JobFiles
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 READY = b"ready"
-_MAX_BYTES = 1 << 20
+_END = b"\n"
+"""Of a message; one without it is of a service that was killed in between, or sent none."""
 
 
 def main(descriptor: int) -> None:
@@ -46,11 +48,12 @@ def main(descriptor: int) -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     end_in_order()
     with contextlib.ExitStack() as stack:
-        with socket.socket(fileno=descriptor) as asked:
+        # Without a buffer no byte of the next message is taken: descriptors come beside the first one of theirs.
+        with socket.socket(fileno=descriptor) as asked, asked.makefile("rb", buffering=0) as lines:
             asked.set_inheritable(False)
             try:
-                settings = asked.recv(_MAX_BYTES)
-                if not settings:
+                settings = lines.readline()
+                if not settings.endswith(_END):
                     return
                 known = json.loads(settings)
                 # Until there is a job, this is said where the service says its own.
@@ -60,10 +63,11 @@ def main(descriptor: int) -> None:
                 warm_up(stack, known)
                 with contextlib.suppress(OSError):
                     asked.sendall(READY)
-                message, descriptors, _, _ = socket.recv_fds(asked, _MAX_BYTES, 3)
+                first, descriptors, _, _ = socket.recv_fds(asked, 1, 3)
+                message = first + lines.readline()
             except (KeyboardInterrupt, ConnectionError):
                 return
-        if message:
+        if message.endswith(_END):
             _do(json.loads(message), *descriptors)
 
 
@@ -140,6 +144,10 @@ def _ended(request: Mapping[str, Any]) -> Ended:
         return Ended(attempt=attempt, outcome="failed", message=str(error))
     except BaseException as error:  # noqa: BLE001 (it is told)
         traceback.print_exc()
+        if own_files.were_changed():
+            # What was loaded and what was imported after that need not fit: a new process goes on.
+            _log.warning("Files of tune-jobs were changed while this ran, as by an upgrade: it goes on later.")
+            return Ended(attempt=attempt, outcome="interrupted")
         return Ended(attempt=attempt, outcome="failed", message=f"{type(error).__name__}: {said_by(error)}")
     if result.interrupted:
         return Ended(attempt=attempt, outcome="stopped")
@@ -182,9 +190,18 @@ def _driven(request: Mapping[str, Any]) -> Any:
             # The race has the job's name, so that an attempt that follows a killed one begins no other.
             return verbs.replicate(place, top=arguments["top"], seeds=arguments["seeds"], race=request["job"], **common)
         case "retry":
-            return verbs.resume(place, retry_failed=True, **common)
+            return verbs.resume(place, retry_failed=_has_to_retry(request), **common)
         case _:
             return verbs.resume(place, **common)
+
+
+def _has_to_retry(request: Mapping[str, Any]) -> bool:
+    """Whether there are failed trials that are to run again: not those that did so for this job, and failed again."""
+    from tune_jobs.store.opening import open_sweep
+
+    failed = [trial for trial in open_sweep(request["sweep"]).read_trials() if trial.status == "failed"]
+    # An attempt lets all of them wait before it trains one, so that of those from before all are left or none.
+    return any(request["attempt"] == 1 or (trial.ended_at or 0.0) < request["started_at"] for trial in failed)
 
 
 def _spec_of(place: str) -> SweepSpec:

@@ -42,7 +42,8 @@ class Ended(BaseModel):
 
     attempt: int
     outcome: Literal["completed", "failed", "stopped", "interrupted"]
-    """Stopped: somebody asked the sweep to stop. Interrupted: a signal came, such as when the service is drained."""
+    """Stopped: somebody asked the sweep to stop. Interrupted: a signal came, such as when the service is drained, or
+    the program's files were changed meanwhile; it goes on later."""
     message: str | None = None
     finish_failed: bool | None = None
     """Whether what follows the trials failed; None: they did not come to their end."""

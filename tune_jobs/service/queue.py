@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Engine, RowMapping, delete, func, insert, select, update
+from sqlalchemy import Connection, Engine, Row, RowMapping, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from policies.errors import NotFoundError, SpecError, fit
@@ -160,29 +160,38 @@ class Queue:
         Args:
             num_cpus: CPUs that there are.
             may_run: Says of a sweep's name whether it may run now, such as that nobody else drives it; None: all may.
+                It is asked of no more sweeps than it takes to find the next one, and of none where none fits.
         """
+        free: str | None = None
+        if may_run is not None:
+            # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
+            free = next(filter(may_run, self._names_in_order(num_cpus)), None)
+            if free is None:
+                return None
         with self._engine.begin() as connection:
             # Whoever claims at the same time waits here, and sees what this one took (SQLite has one writer). All
             # lock in one order, so that no two wait for each other.
-            query = select(jobs).where(jobs.c.state.in_(("waiting", "running"))).order_by(jobs.c.id).with_for_update()
-            open_jobs = _jobs(connection, query)
-            running = [job for job in open_jobs if job.state == "running"]
-            busy = {job.sweep for job in running}
-            first: dict[str, Job] = {}
-            for job in sorted((job for job in open_jobs if job.state == "waiting"), key=lambda job: job.id):
-                first.setdefault(job.sweep, job)
-            waiting = [job for name, job in first.items() if name not in busy and (may_run is None or may_run(name))]
+            waiting, running = _open_jobs(connection, _OPEN.with_for_update())
+            waiting = [job for job in waiting if free is None or job.sweep == free]
             if not waiting:
                 return None
-            owners = {job.owner for job in waiting}
-            job = _next(waiting, running, _last_started(connection, owners))
-            if running and sum(item.num_cpus for item in running) + job.num_cpus > num_cpus:
+            job = _in_order(connection, waiting, running)[0]
+            if not _fits(job, running, num_cpus):
                 return None
             values = {
                 "state": "running", "started_at": job.started_at or self._now(), "num_attempts": job.num_attempts + 1,
             }  # fmt: skip
             connection.execute(update(jobs).where(jobs.c.id == job.id, jobs.c.state == "waiting").values(values))
             return _job(connection, job.id)
+
+    def _names_in_order(self, num_cpus: float) -> list[str]:
+        """Return the sweeps of the jobs that may be next, the first one first; none where no job fits."""
+        with self._engine.begin() as connection:
+            waiting, running = _open_jobs(connection, _OPEN)
+            smallest = min(waiting, key=_cpus_of, default=None)
+            if smallest is None or not _fits(smallest, running, num_cpus):
+                return []
+            return [job.sweep for job in _in_order(connection, waiting, running)]
 
     def again(self, job_id: int) -> Job:
         """Note that a running job gets another driver process, as the last one died."""
@@ -291,22 +300,54 @@ class Queue:
             return _job(connection, job_id)
 
 
-def _next(waiting: Sequence[Job], running: Sequence[Job], last_started: Mapping[str, float]) -> Job:
+_OF_ORDER = ("id", "sweep", "owner", "priority", "num_cpus", "state", "num_attempts", "started_at")
+_OPEN = (
+    select(*(jobs.c[name] for name in _OF_ORDER)).where(jobs.c.state.in_(("waiting", "running"))).order_by(jobs.c.id)
+)
+"""What says which job is next: there may be thousands, and they are looked at some times a second."""
+
+
+def _open_jobs(connection: Connection, query: Any) -> tuple[list[Row[Any]], list[Row[Any]]]:
+    """Return the first waiting job of each sweep that has no running one, and the running jobs."""
+    open_jobs = connection.execute(query).all()
+    running = [job for job in open_jobs if job.state == "running"]
+    busy = {job.sweep for job in running}
+    first: dict[str, Row[Any]] = {}
+    for job in open_jobs:
+        if job.sweep not in busy:
+            first.setdefault(job.sweep, job)
+    return list(first.values()), running
+
+
+def _fits(job: Row[Any], running: Sequence[Row[Any]], num_cpus: float) -> bool:
+    """Whether a job's CPUs are free; with nothing running, everything fits."""
+    return not running or sum(map(_cpus_of, running)) + _cpus_of(job) <= num_cpus
+
+
+def _cpus_of(job: Row[Any]) -> float:
+    return _finite_cpus(job.num_cpus)
+
+
+def _finite_cpus(num_cpus: float) -> float:
+    """Return the CPUs of a job: earlier versions wrote infinity for a cluster's, which JSON has not."""
+    return num_cpus if math.isfinite(num_cpus) else 1.0
+
+
+def _in_order(connection: Connection, waiting: Sequence[Row[Any]], running: Sequence[Row[Any]]) -> list[Row[Any]]:
     num_running = Counter(job.owner for job in running)
-    return min(
+    last_started = _last_started(connection, {job.owner for job in waiting})
+    return sorted(
         waiting,
         key=lambda job: (-job.priority, num_running[job.owner], last_started.get(job.owner, 0.0), job.id),
     )
 
 
 def _last_started(connection: Connection, owners: set[str]) -> dict[str, float]:
-    rows = connection.execute(
-        select(jobs.c.owner, jobs.c.started_at).where(jobs.c.owner.in_(owners), jobs.c.started_at.is_not(None))
+    """Return when the last job of each owner began, without those of whom none has."""
+    found = select(jobs.c.owner, func.max(jobs.c.started_at).label("last")).where(
+        jobs.c.owner.in_(owners), jobs.c.started_at.is_not(None)
     )
-    last: dict[str, float] = {}
-    for owner, started in rows:
-        last[owner] = max(started, last.get(owner, 0.0))
-    return last
+    return {row.owner: row.last for row in connection.execute(found.group_by(jobs.c.owner))}
 
 
 def _jobs(connection: Connection, query: Any) -> list[Job]:
@@ -321,6 +362,4 @@ def _job(connection: Connection, job_id: int) -> Job:
 
 
 def _as_job(row: RowMapping) -> Job:
-    # Earlier versions wrote infinity for a cluster's, which JSON has not.
-    num_cpus = row["num_cpus"] if math.isfinite(row["num_cpus"]) else 1.0
-    return Job.model_validate({**row, "num_cpus": num_cpus})
+    return Job.model_validate({**row, "num_cpus": _finite_cpus(row["num_cpus"])})

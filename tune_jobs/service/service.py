@@ -179,6 +179,7 @@ def _where(config: ServiceConfig) -> str:
 @contextlib.contextmanager
 def _alone(config: ServiceConfig) -> Iterator[None]:
     folder, is_own = config.folder, config.own_folder is not None
+    option = "--folder" if is_own else "--storage"
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
@@ -189,12 +190,17 @@ def _alone(config: ServiceConfig) -> Iterator[None]:
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             raise CannotRunError(
                 f"Another service has the folder {folder}."
                 if is_own
                 else f"Another service has the storage folder {folder.parent}.",
-                f"End it first, or give another {'--folder' if is_own else '--storage'}.",
+                f"End it first, or give another {option}.",
+            ) from error
+        except OSError as error:
+            raise CannotRunError(
+                f"The service can't lock {folder / 'lock'}: {error.strerror}.",
+                f"Give another {option}, on a file system that has locks.",
             ) from error
         yield
     finally:

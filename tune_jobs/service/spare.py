@@ -41,7 +41,11 @@ class Driver:
     """
 
     def __init__(self, settings: Mapping[str, Any], module: str = "tune_jobs.service.driver") -> None:
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            # Not SOCK_SEQPACKET, which would keep messages apart: macOS has none.
+            self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        except OSError as error:
+            raise _not_started(error) from error
         code = _BEGIN.format(root=_ROOT, module=module, descriptor=theirs.fileno())
         try:
             self._process = subprocess.Popen(  # noqa: S603 (this very Python)
@@ -54,13 +58,10 @@ class Driver:
             )
         except OSError as error:
             self._socket.close()
-            raise CannotRunError(
-                f"No process can be started to run a sweep in ({sys.executable}): {error}.",
-                "See what limits the processes of this user, with `ulimit -u`.",
-            ) from error
+            raise _not_started(error) from error
         finally:
             theirs.close()
-        self._socket.sendall(json.dumps(dict(settings)).encode())
+        self._socket.sendall(_line(settings))
 
     @property
     def pid(self) -> int:
@@ -96,8 +97,10 @@ class Driver:
             raise CannotRunError(
                 f"The service can't write {log}: {error.strerror}.", "Check the storage folder."
             ) from error
+        line = _line(request)
         try:
-            socket.send_fds(self._socket, [json.dumps(request).encode()], [lock, descriptor])
+            num_sent = socket.send_fds(self._socket, [line], [lock, descriptor])
+            self._socket.sendall(line[num_sent:])
         except OSError as error:
             raise CannotRunError(f"The process {self.pid} for the sweep died before it began: {error}.") from error
         finally:
@@ -121,6 +124,18 @@ class Driver:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_PATIENCE_S)
                 return
+
+
+def _not_started(error: OSError) -> CannotRunError:
+    return CannotRunError(
+        f"No process can be started to run a sweep in ({sys.executable}): {error}.",
+        "See what limits the processes and the files of this user, with `ulimit -u` and `ulimit -n`.",
+    )
+
+
+def _line(message: Mapping[str, Any]) -> bytes:
+    """A message as `driver.main` reads it: one line, as JSON has no other end of a line in it."""
+    return json.dumps(dict(message)).encode() + b"\n"
 
 
 def memory_of_tree(pid: int) -> int | None:

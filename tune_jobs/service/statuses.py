@@ -6,9 +6,11 @@ done less often.
 
 from __future__ import annotations
 
+import contextvars
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from analysis.records import TrialRecord
@@ -19,7 +21,9 @@ from tune_jobs.service.folder_names import check_text
 from tune_jobs.service.storage_health import is_of_store
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Storage, Sweep
+from tune_jobs.store.objects.at_once import AT_ONCE
 from tune_jobs.store.patience import impatient
+from tune_jobs.store.urls import is_url
 from tune_jobs.sweeps.reached import as_reached, reached_by_now
 from tune_jobs.sweeps.status import SweepStatus, as_left, status_of, was_killed
 
@@ -109,6 +113,8 @@ class Statuses:
         self._seen: dict[str, Seen] = {}
         self._locks: dict[str, threading.Lock] = {}
         self._lock = threading.Lock()
+        # Not those for single requests: who looks at a sweep may wait for another who does, and makes such requests.
+        self._looking = ThreadPoolExecutor(AT_ONCE, "statuses")
 
     def see(self, name: str) -> Seen:
         """Return a sweep as it is, or was a moment ago.
@@ -207,18 +213,27 @@ class Statuses:
             CheckpointError: They can't be listed.
             CannotRunError: Their store does not answer.
         """
-        found = []
         with impatient():
-            sweeps = self._storage.sweeps()
-        for sweep in sweeps:
-            try:
-                found.append(self.see(sweep.name))
-            except TuneJobsError as error:
-                if is_of_store(self._storage, error):
-                    # Without those that it has, a list would say that they are gone.
-                    raise
-                leave_out(error)
-        return found
+            names = [sweep.name for sweep in self._storage.sweeps()]
+        return [seen for seen in self._each(names) if seen is not None]
+
+    def _each(self, names: Sequence[str]) -> Iterable[Seen | None]:
+        """Look at several sweeps; at those of an object store side by side, as each look waits for answers."""
+        if not is_url(self._storage.place):
+            return map(self._readable, names)
+        contexts = [contextvars.copy_context() for _ in names]
+        return self._looking.map(lambda context, name: context.run(self._readable, name), contexts, names)
+
+    def _readable(self, name: str) -> Seen | None:
+        """Return a sweep as `see` does; None, with a warning: it can't be read."""
+        try:
+            return self.see(name)
+        except TuneJobsError as error:
+            if is_of_store(self._storage, error):
+                # Without those that it has, a list would say that they are gone.
+                raise
+            leave_out(error)
+            return None
 
     def forget(self, name: str) -> None:
         """Forget a sweep that is no more."""

@@ -7,6 +7,7 @@ of the job's file. So a service that was killed, and began anew, does the same a
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import threading
@@ -27,6 +28,7 @@ from tune_jobs.service.spare import Driver, memory_of_tree
 from tune_jobs.service.storage_health import is_of_store
 from tune_jobs.service.surroundings import Surroundings
 from tune_jobs.store.contract import Storage, Sweep
+from tune_jobs.store.half_made import free_half_made
 
 _log = logging.getLogger(__name__)
 
@@ -66,13 +68,9 @@ class Supervisor:
         settle: Callable[[], None] = lambda: None,
     ) -> None:
         self._queue, self._storage, self._where = queue, storage, where
-        self._spare_idle_s, self._on_end, self._on_death, self._make_driver = (
-            spare_idle_s,
-            on_end,
-            on_death,
-            make_driver,
-        )
-        self._outages, self._settle = Outages() if outages is None else outages, settle
+        self._spare_idle_s, self._on_end, self._on_death = spare_idle_s, on_end, on_death
+        self._make_driver, self._settle = make_driver, settle
+        self._outages = Outages() if outages is None else outages
         self._idle_since = time.monotonic()
         self._spare: Driver | None = None
         self._children: dict[int, Driver] = {}
@@ -163,9 +161,9 @@ class Supervisor:
     def reconcile(self) -> None:
         """Make queue and folders agree, after a start: folders are the truth.
 
-        A job whose sweep was never written is forgotten. Sweeps that were written but not begun, or whose driver was
-        killed, and that have no job, get one: the database was lost, or they were made by somebody else's hands. Those
-        whose job was stopped, or failed, wait for somebody who resumes them.
+        A job whose sweep was never written is forgotten, and what there is of that removed. Sweeps that were written
+        but not begun, or whose driver was killed, and that have no job, get one: the database was lost, or they were
+        made by somebody else's hands. Those whose job was stopped, or failed, wait for somebody who resumes them.
         """
         open_jobs = self._queue.jobs("creating", "waiting", "running")
         for job in open_jobs:
@@ -174,6 +172,7 @@ class Supervisor:
             if self._storage.sweep(job.sweep).exists():
                 self._queue.created(job.id, num_cpus=self._where.unplanned_cpus)
             else:
+                free_half_made(self._storage, job.sweep)
                 self._queue.forget(job.id)
         known = {job.sweep for job in open_jobs}
         ours = {holder.sweep for holder in held_jobs(self._where.service_folder)}
@@ -217,10 +216,9 @@ class Supervisor:
                 return  # the database was silent for long: another service may have it by now
             with self._apart(job.sweep):
                 self._look_at(job)
-        # Before the queue is locked, as a store elsewhere may have to be watched for some seconds.
-        free = {name for name in {job.sweep for job in self._queue.jobs("waiting")} if self._may_run(name)}
+        may_run = functools.cache(self._may_run)
         while self._end.is_set() == was_over and not self._draining.is_set():
-            claimed = self._queue.claim(self._where.num_cpus, free.__contains__)
+            claimed = self._queue.claim(self._where.num_cpus, may_run)
             if claimed is None:
                 break
             self._start(claimed)
@@ -329,6 +327,7 @@ class Supervisor:
                 "job": job.uid,
                 "number": job.id,
                 "attempt": job.num_attempts,
+                "started_at": job.started_at,
                 "sweep": self._sweep(job.sweep).place,
                 "verb": job.verb,
                 "arguments": job.arguments,

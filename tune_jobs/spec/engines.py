@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from policies.errors import CheckpointError
+from policies.errors import UPGRADE, CheckpointError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, RandomHyperparams
 
 Need = Literal["rl_module", "convolutions", "large_images", "env_runners", "copies", "pauses", "unseeded"]
@@ -134,7 +134,7 @@ def engine_named(name: str, where: str = "A record") -> Engine:
         known = ", ".join(each.name for each in ENGINES)
         raise CheckpointError(
             f"{where} names the engine {name[:80]!r}, which this tune-jobs does not have; it has {known}.",
-            "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
+            UPGRADE,
         )
     return engine
 

@@ -21,9 +21,10 @@ from tune_jobs.spec.fields import Section
 from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
 from tune_jobs.spec.sections import AboutSpec
-from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.sweep_spec import STORED, SweepSpec
 from tune_jobs.spec.yaml import parse_value, parse_yaml
 from tune_jobs.store.names import SWEEP_RECORD
+from tune_jobs.store.presence import is_file
 
 # The most bytes of a file, for the most characters that are read, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
@@ -138,7 +139,11 @@ def stored_spec(record: SweepRecord) -> SweepSpec:
         # Another version may have fields that are null, and that this one doesn't know.
         stored = {key: value for key, value in record.spec.items() if value is not None}
         # A sweep of a version that had no such stage ended without it, and is not to begin training when it is read.
-        return SweepSpec.model_validate({"confirm": "none"} | stored)
+        stored = {"confirm": "none"} | stored
+        if isinstance(env := stored.get("env"), Mapping):
+            # One of a version that knew no masks trains on without the one that its environment may have.
+            stored["env"] = {"action_mask": False} | dict(env)
+        return SweepSpec.model_validate(stored, context=STORED)
     except WrongSpecError as error:
         told = "; ".join(f"spec.{path}: {text}" for path, text in error.problems)
         raise CheckpointError(
@@ -239,7 +244,11 @@ def read_sweep_file(source: str | Path) -> tuple[str, str]:
         SpecError: There is no such file or preset, or it can't be read.
     """
     path = Path(source)
-    if not path.is_file():
+    try:
+        is_there = is_file(path)
+    except CheckpointError as error:
+        raise SpecError(error.message, error.hint) from error
+    if not is_there:
         presets = _preset_files()
         if str(source) in presets:
             return f"preset {source}", presets[str(source)].read_text(encoding="utf-8")

@@ -101,7 +101,23 @@ def idle_settings(spec: SweepFields) -> list[str]:
         for name, types in fields.items():
             if given.type not in types and getattr(given, name) != type(given).model_fields[name].default:
                 notes.append(f"{section}.{name} can't act: {section}.type is {given.type}, not {' or '.join(types)}.")
-    return notes + _cost_notes(spec)
+    return notes + _cost_notes(spec) + _notes_without_settings(spec)
+
+
+def _notes_without_settings(spec: SweepFields) -> list[str]:
+    """Return the notes on what was changed of how settings are judged, in a population, which has none."""
+    if not spec.scheduler.is_population:
+        return []
+    why = f"trials of a population (scheduler.type {spec.scheduler.type}) change their values while they train"
+    objective, confirm, notes = spec.objective, spec.confirm, []
+    if objective.type != type(objective)().type:
+        notes.append(
+            f"objective.type {objective.type} is for charts of the report alone: {why}, so that there are no "
+            "settings to judge, and are compared by their evaluations."
+        )
+    if confirm.max_share > 0 and confirm != type(confirm)():
+        notes.append(f"confirm can't act: {why}, so that there are no settings to train again.")
+    return notes
 
 
 def _cost_notes(spec: SweepFields) -> list[str]:

@@ -195,7 +195,7 @@ class CheckpointSpec(Section):
     NEVER_EMPTY: ClassVar[frozenset[str]] = frozenset({"keep"})
 
     every_iterations: PositiveWhole = Field(10, description="Save at each multiple of this, and at the end.")
-    keep: NonNegativeWhole = Field(2, description="How many of the newest to keep besides the best and the latest.")
+    keep: NonNegativeWhole = Field(2, description="How many of the newest to keep, the latest among them.")
 
 
 class ResourcesSpec(Section):

@@ -14,6 +14,7 @@ from typing import Any, Self
 from pydantic import (
     ModelWrapValidatorHandler,
     ValidationError,
+    ValidationInfo,
     model_validator,
 )
 
@@ -29,6 +30,11 @@ from tune_jobs.spec.rules import env_problems, search_problems, why_none
 from tune_jobs.spec.sections import NAME_PATTERN, NAME_RULE, SweepFields
 from tune_jobs.spec.training_length import length_problems, with_longest
 
+STORED = {"is_stored": True}
+"""The context in which a spec is validated that an older version may have written."""
+_LATER = frozenset({"resources.num_gpus", "space.target_update_unit"})
+"""The settings of which 0.1.0 launched sweeps that are refused now: they are read, and nothing more of them trains."""
+
 
 class SweepSpec(SweepFields):
     """One sweep: what is searched, for how long, and with which resources."""
@@ -40,7 +46,7 @@ class SweepSpec(SweepFields):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _is_right(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _is_right(cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
         """Check the whole sweep too, and report problems in the sweep file's words; SpecErrors pass unchanged."""
         try:
             spec = handler(data)
@@ -52,10 +58,21 @@ class SweepSpec(SweepFields):
         problems = hyperparam_problems(spec.algorithm, spec.hyperparams, spec.space) + of_conditions
         # Points are counted there, which takes conditions that are right; those of unknown names were not looked at.
         if not problems or not any(domain.when for domain in spec.space.values()):
-            problems += _section_problems(spec)
+            found = _section_problems(spec)
+            problems += found if info.context != STORED else [each for each in found if each.path not in _LATER]
         if problems:
             raise WrongSpecError.of("SweepSpec", problems)
         return spec
+
+
+def check_trainable(spec: SweepSpec) -> None:
+    """Check that a sweep that is read from its record may train more, as one that is launched now.
+
+    Raises:
+        WrongSpecError: An older version launched it with a setting that is refused now.
+    """
+    if problems := [each for each in _section_problems(spec) if each.path in _LATER]:
+        raise WrongSpecError.of(spec.name or "sweep", problems)
 
 
 def check_sweep_name(name: str) -> str:

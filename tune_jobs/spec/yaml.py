@@ -157,6 +157,8 @@ class _Loader(yaml.SafeLoader):
     def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
         """Compose a scalar; the tag of `!!int "5"` asks for the meaning of the word without quotes."""
         node: yaml.ScalarNode = super().compose_scalar_node(anchor)
+        # JSON escapes a character that does not fit into 16 bits as the two halves of a surrogate pair.
+        node.value = node.value.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "surrogatepass")
         if node.tag in (_NULL, _BOOL, _INT, _FLOAT):
             meant = self.resolve(yaml.ScalarNode, node.value, (True, False))  # type: ignore[no-untyped-call]
             if meant not in (node.tag, _TWO_MEANINGS) and (node.tag, meant) != (_FLOAT, _INT):

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
+from analysis.compact import CompactResults
 from analysis.numbering import place_of
 from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS, SWEEP_RECORD
+from tune_jobs.store.presence import is_there
 from tune_jobs.store.results_file import Scored
 
 _LOG = logging.getLogger(__name__)
@@ -58,17 +60,19 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
     return sorted(records, key=lambda record: record.index)
 
 
-def read_results(store: Sweep) -> dict[str, list[IterationRecord]]:
+def read_results(store: Sweep) -> CompactResults:
     """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
-    found = {}
     with store.reading():
-        for record in readable_trials(store):
-            try:
-                found[record.trial_id] = store.trial(record.trial_id).read_iterations()
-            except CheckpointError as error:
-                leave_out(error)
-                found[record.trial_id] = []
-    return found
+        return CompactResults(_read_results(store))
+
+
+def _read_results(store: Sweep) -> Iterator[tuple[str, Sequence[IterationRecord]]]:
+    for record in readable_trials(store):
+        try:
+            yield record.trial_id, store.trial(record.trial_id).read_iterations()
+        except CheckpointError as error:
+            leave_out(error)
+            yield record.trial_id, ()
 
 
 def candidates(trial: Trial) -> list[CheckpointRecord]:
@@ -79,7 +83,7 @@ def candidates(trial: Trial) -> list[CheckpointRecord]:
             known.append(trial.checkpoint(iteration))
         except NotFoundError as error:
             # Deleted meanwhile, if its trial still runs.
-            if trial.checkpoint_folder(iteration).exists():
+            if is_there(trial.checkpoint_folder(iteration)):
                 leave_out(error)
     recorded: Mapping[int, Sequence[Scored]] = {}
     try:

@@ -67,7 +67,11 @@ class Sweep(Protocol):
     # -- its existence
 
     def exists(self) -> bool:
-        """Whether the sweep exists: from the first `write_record` on. One that may not be read exists too."""
+        """Whether the sweep exists: from the first `write_record` on. One that may not be read exists too.
+
+        Raises:
+            CheckpointError: The storage gives no answer; an object store's error is a CannotRunError.
+        """
         ...
 
     def create(self) -> None:

@@ -8,7 +8,6 @@ driver was killed in between, the copy is ignored.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from analysis.records import ChangeRecord, CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
@@ -47,20 +46,6 @@ def copy_latest_checkpoint(source: Trial, target: Trial, iteration: int) -> Chec
         + (f": {reason}." if reason is not None else "."),
         "Look for the cause in the trial's log and the storage folder; the sweep continues without this copy.",
     )
-
-
-def pending_copy(trial: Trial, change: ChangeRecord | None, latest_iteration: int) -> Path | None:
-    """Return the copy that a trial continues from, if none of its own checkpoints is newer.
-
-    Args:
-        trial: The trial.
-        change: Its newest change.
-        latest_iteration: The iteration of its own latest checkpoint; 0: it has none.
-    """
-    if change is None or latest_iteration > change.iteration:
-        return None
-    folder = trial.copied_checkpoint(change.iteration)
-    return folder if folder.is_dir() else None
 
 
 def remove_uncounted_copies(trial: Trial, changes: Sequence[ChangeRecord]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path, PurePath
 from policies.errors import NotFoundError
 from policies.files import absolute
 from tune_jobs.store.command_names import name_taken
+from tune_jobs.store.presence import is_link, is_there
 from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
 
 _MAX_NAME_BYTES = 255
@@ -43,9 +44,13 @@ class LocalStorage:
         return sweep
 
     def is_taken(self, name: str) -> bool:
-        """Whether there is anything of this name; a link to what isn't there is in the way of a folder, too."""
+        """Whether there is anything of this name; a link to what isn't there is in the way of a folder, too.
+
+        Raises:
+            CheckpointError: The storage gives no answer.
+        """
         folder = self.sweep(name).folder
-        return folder.is_symlink() or folder.exists()
+        return is_link(folder) or is_there(folder)
 
     def sweeps(self) -> list[SweepStore]:
         """Return the sweeps in the folder, by name."""

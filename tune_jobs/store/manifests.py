@@ -8,6 +8,7 @@ its hash. The score is in `results.jsonl` too, and `tune_jobs.store.candidates` 
 from __future__ import annotations
 
 import re
+from collections.abc import Container
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,11 +16,16 @@ from analysis.records import CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import refuse_others, sha256_file, sync, write_plain
 from tune_jobs.store.names import MANIFEST
-from tune_jobs.store.places import refuse_link, within
+from tune_jobs.store.places import parts_below, refuse_link, within
+from tune_jobs.store.presence import is_file, is_folder
 from tune_jobs.store.record_files import dump_sealed, parse_record, read_json
 
 _POLICY_FILES = ("policy.json", "policy.safetensors")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+# What Finder and Explorer leave in a folder that is looked at, and NFS for a file that was deleted while it was open.
+_OF_THE_SYSTEM = re.compile(r"\.DS_Store|Thumbs\.db|desktop\.ini|\.nfs[0-9a-f]+")
+# Where a file system has no room for it, what macOS knows of a file X is in a file ._X beside it.
+_BESIDE = re.compile(r"\._(.*[^.].*)")
 _HINT = "Use another checkpoint of the trial, or restore the file from a backup."
 
 
@@ -36,13 +42,23 @@ def write_manifest(folder: Path, record: CheckpointRecord, engine: str = "") -> 
     }
     named = {"engine": engine} if engine else {}
     write_plain(folder / MANIFEST, dump_sealed(record, **named, files=files))
-    for path in [*folder.rglob("*"), folder]:
+    sync_folder(folder)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until a folder is on disk with all that is in it."""
+    for path in [*parts_below(folder), folder]:
         sync(path)
 
 
 def is_checkpoint(folder: Path) -> bool:
-    """Whether a folder is a checkpoint's, judged by whether it has a manifest, which is not read."""
-    return (folder / MANIFEST).is_file()
+    """Whether a folder is a checkpoint's, judged by whether it has a manifest, which is not read.
+
+    Raises:
+        CheckpointError: This cannot be found out.
+    """
+    # The folder first, so that an error names what was given.
+    return is_folder(folder) and is_file(folder / MANIFEST)
 
 
 def read_manifest(checkpoint: Path) -> CheckpointRecord:
@@ -77,7 +93,7 @@ def verify_checkpoint(checkpoint: Path) -> CheckpointRecord:
     try:
         return _verified(checkpoint)
     except (OSError, CheckpointError) as error:
-        if not checkpoint.is_dir():
+        if not is_folder(checkpoint):
             raise _no_folder(checkpoint) from None
         if isinstance(error, CheckpointError):
             raise
@@ -127,11 +143,11 @@ def files_of(checkpoint: Path) -> dict[str, Path]:
 
 
 def _read(checkpoint: Path) -> tuple[CheckpointRecord, dict[str, Any]]:
-    if not checkpoint.is_dir():
+    if not is_folder(checkpoint):
         raise _no_folder(checkpoint)
     path = checkpoint / MANIFEST
     refuse_link(path)
-    if not path.is_file():
+    if not is_file(path):
         raise CheckpointError(
             f"Checkpoint {checkpoint} has no {MANIFEST}: it is not a checkpoint, or was not completely written.",
             "Use another checkpoint of the trial, or delete this folder.",
@@ -169,22 +185,33 @@ def _described_files(manifest: Path, files: Any) -> dict[str, tuple[int, str]]:
 
 
 def _files_in(folder: Path) -> dict[str, Path]:
-    """Return the files of a checkpoint by name, without its manifest.
+    """Return the files of a checkpoint by name, without its manifest and what systems add of their own accord.
 
     Raises:
         CheckpointError: Something in it is a symbolic link, or neither a file nor a folder.
     """
     files = {}
-    for path in sorted(folder.rglob("*")):
-        refuse_link(path)
+    paths = dict.fromkeys(parts_below(folder))
+    for path in paths:
         name = path.relative_to(folder).as_posix()
-        if not path.is_dir() and name != MANIFEST:
+        if name != MANIFEST and not is_folder(path):
             try:
                 refuse_others(path.stat(), path)
+            except FileNotFoundError:
+                # NFS has removed it by now, or somebody else: whoever needs it misses it.
+                continue
             except OSError as error:
                 raise CheckpointError(f"Checkpoint {folder}: of {name}, {error.strerror}.", _HINT) from error
-            files[name] = path
+            if not _is_of_the_system(path, paths):
+                files[name] = path
     return files
+
+
+def _is_of_the_system(path: Path, paths: Container[Path]) -> bool:
+    """Whether a file among those of a checkpoint has a name that systems give to their own, which no engine reads."""
+    if (beside := _BESIDE.fullmatch(path.name)) is not None:
+        return path.with_name(beside[1]) in paths
+    return _OF_THE_SYSTEM.fullmatch(path.name) is not None
 
 
 def _shown(value: Any) -> str:

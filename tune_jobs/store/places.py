@@ -7,14 +7,16 @@ sweep folder itself, and the folders above it, may be links, because the user wh
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from analysis.records import TRIAL_ID_PATTERN
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from tune_jobs.store.presence import is_absent, is_folder, is_link, is_there, unseen
 
 _CHECKPOINT_NAME = re.compile(r"[0-9]{6,19}")
 _TRIAL_ID = re.compile(TRIAL_ID_PATTERN)
@@ -78,11 +80,7 @@ def refuse_link(path: Path) -> None:
     Raises:
         CheckpointError: It is one, or this cannot be found out.
     """
-    try:
-        is_link = path.is_symlink()
-    except OSError as error:
-        raise _unseen(path, error) from error
-    if is_link:
+    if is_link(path):
         raise CheckpointError(
             f"{path} is a symbolic link; links in a sweep folder are not followed.",
             "Remove the link, or replace it with the file or folder that it points to.",
@@ -96,29 +94,44 @@ def refuse_linked_sweep(folder: Path) -> None:
         CannotRunError: It is a link, or this cannot be found out.
     """
     try:
-        target = folder.readlink() if folder.is_symlink() else None
+        target = folder.readlink()
     except OSError as error:
+        if is_absent(error) or error.errno == errno.EINVAL:  # it is no link
+            return
         raise CannotRunError(
             f"{folder} cannot be looked at: {error.strerror or error}.",
             "Check the permissions of the folders above it.",
         ) from error
-    if target is not None:
-        raise CannotRunError(
-            f"{folder} is a symbolic link to {target}; a sweep is not removed through a link.",
-            "Remove the link, or the folder that it points to.",
-        )
+    raise CannotRunError(
+        f"{folder} is a symbolic link to {target}; a sweep is not removed through a link.",
+        "Remove the link, or the folder that it points to.",
+    )
 
 
 def refuse_links_in(folder: Path) -> Path:
     """Return a folder, which need not exist, if neither it nor anything in it is a symbolic link.
 
     Raises:
-        CheckpointError: There is a symbolic link.
+        CheckpointError: There is a symbolic link, or it cannot be found out whether there is.
     """
     refuse_link(folder)
-    for path in folder.rglob("*"):
-        refuse_link(path)
+    for _ in parts_below(folder):
+        pass
     return folder
+
+
+def parts_below(folder: Path) -> Iterator[Path]:
+    """Yield the contents of a folder and of the folders in it, in order; none if it is not a folder.
+
+    Raises:
+        CheckpointError: There is a symbolic link, or something cannot be read.
+    """
+    # Not `rglob`, which leaves out a folder that cannot be read.
+    for path in sorted(parts_of(folder)):
+        refuse_link(path)
+        yield path
+        if is_folder(path):
+            yield from parts_below(path)
 
 
 def parts_of(folder: Path) -> list[Path]:
@@ -137,26 +150,20 @@ def names_in(folder: Path) -> list[str]:
         CheckpointError: It cannot be read.
     """
     try:
-        return os.listdir(folder) if folder.is_dir() else []  # noqa: PTH208 (thousands of paths take long to make)
+        return os.listdir(folder)  # noqa: PTH208 (thousands of paths take long to make)
     except OSError as error:
-        raise _unseen(folder, error) from error
-
-
-def _unseen(path: Path, error: OSError) -> CheckpointError:
-    return CheckpointError(
-        f"{path} cannot be read: {error.strerror or error}.", "Check the permissions of the folders above it."
-    )
+        if is_absent(error):
+            return []
+        raise unseen(folder, error) from error
 
 
 def stamp_of(path: str | Path) -> tuple[int, ...]:
     """Return what changes whenever a file is replaced or written; empty: it does not exist."""
     try:
         found = os.lstat(path)
-    except PermissionError:
-        # It counts as one that exists: whoever reads it is told.
-        return (0,)
-    except OSError:
-        return ()
+    except OSError as error:
+        # What cannot be looked at counts as one that exists: whoever reads it is told.
+        return () if is_absent(error) else (0,)
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
@@ -164,8 +171,8 @@ def not_older(files: Iterable[Path], others: Iterable[Path]) -> bool:
     """Whether files exist that were written when others were, or later; others that do not exist do not count."""
     try:
         oldest = min(path.stat().st_mtime_ns for path in files)
-        return all(path.stat().st_mtime_ns <= oldest for path in others if path.exists())
-    except OSError:
+        return all(path.stat().st_mtime_ns <= oldest for path in others if is_there(path))
+    except (OSError, CheckpointError):
         return False
 
 

@@ -14,8 +14,8 @@ from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from analysis.records import FORMAT_VERSION
-from policies.errors import CheckpointError, NotFoundError
+from analysis.records import FORMAT_VERSION, SEALED_FORMAT_VERSION
+from policies.errors import UPGRADE, CheckpointError, NotFoundError
 from policies.files import read_regular
 from policies.wrong_values import details_of, dotted, explain
 
@@ -35,7 +35,7 @@ def dump(record: BaseModel, indent: int | None = 1) -> str:
 
 def dump_sealed(record: BaseModel, **more: Any) -> str:
     """Return a record as it is written, with more fields and a seal."""
-    data = json.loads(record.model_dump_json()) | more | {"format_version": FORMAT_VERSION}
+    data = json.loads(record.model_dump_json()) | more | {"format_version": SEALED_FORMAT_VERSION}
     return json.dumps({**data, _SEAL: seal(data)}, indent=1) + "\n"
 
 
@@ -83,7 +83,7 @@ def read_json(path: Path, what: str, *, is_sealed: bool = False) -> dict[str, An
     if version > FORMAT_VERSION:
         raise CheckpointError(
             f"{path} has format version {version}; this tune-jobs reads up to {FORMAT_VERSION}.",
-            "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
+            UPGRADE,
         )
     if is_sealed and (version >= _FIRST_SEALED_VERSION or _SEAL in data) and data.get(_SEAL) != _seal_of(data):
         raise CheckpointError(

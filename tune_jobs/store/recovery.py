@@ -10,13 +10,14 @@ import contextlib
 import json
 from pathlib import Path
 
-from analysis.records import FORMAT_VERSION, CheckpointRecord
+from analysis.records import FORMAT_VERSION, ChangeRecord, CheckpointRecord
 from policies.errors import CheckpointError, NotFoundError
 from policies.files import RefusedFileError, read_regular
 from tune_jobs.store.contract import Trial
 from tune_jobs.store.manifests import verify_checkpoint
 from tune_jobs.store.names import DAMAGED_RESULTS, MANIFEST, RESULTS
 from tune_jobs.store.places import within
+from tune_jobs.store.presence import is_folder
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.results_file import ResultsFile
 
@@ -83,17 +84,31 @@ def take_up_checkpoints(trial: Trial) -> tuple[list[CheckpointRecord], list[str]
     return known, notes
 
 
-def take_up_copy(trial: Trial, folder: Path) -> tuple[Path | None, list[str]]:
-    """Verify the copied checkpoint that a trial continues from; return None if it is damaged and set aside."""
+def take_up_copy(trial: Trial, change: ChangeRecord | None, latest_iteration: int) -> tuple[Path | None, list[str]]:
+    """Return the copy that a trial continues from, verified, if none of its own checkpoints is newer; see `copies`.
+
+    Args:
+        trial: The trial.
+        change: Its newest change.
+        latest_iteration: The iteration of its own latest checkpoint; 0: it has none.
+
+    Returns:
+        The copy, or None, and a note on one that is missing, or damaged and set aside.
+
+    Raises:
+        CheckpointError: It cannot be found out whether there is one, or it cannot be read now.
+    """
+    if change is None or latest_iteration > change.iteration:
+        return None, []
+    folder = trial.copied_checkpoint(change.iteration)
+    goes_on = "the trial goes on from its own latest checkpoint, with the values it was given."
+    if not is_folder(folder):
+        return None, [f"the copied checkpoint {folder.name} is missing; {goes_on}"]
     try:
         verify_checkpoint(folder)
     except NotFoundError as error:
         target = trial.set_aside(_damaged(folder, error), prefix="copied-")
-        note = (
-            f"the copied checkpoint {folder.name} is damaged and kept as {target}; the trial goes on from its own "
-            f"latest checkpoint, with the values it was given. {error.message}"
-        )
-        return None, [note]
+        return None, [f"the copied checkpoint {folder.name} is damaged and kept as {target}; {goes_on} {error.message}"]
     return folder, []
 
 

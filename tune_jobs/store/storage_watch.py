@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from policies.errors import CannotRunError
+from policies.errors import CannotRunError, CheckpointError
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.urls import is_url
 
@@ -41,7 +41,7 @@ class StorageWatch:
         self._looked_at = now
         try:
             is_there = self._store.exists()
-        except OSError:
+        except CheckpointError:
             # A file system that answers by errors of its own.
             is_there = False
         if is_there:

@@ -6,7 +6,6 @@ The layout is in `docs/design.md`, "On disk"; the names of the parts are in `nam
 from __future__ import annotations
 
 import contextlib
-import os
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -37,6 +36,7 @@ from tune_jobs.store.places import (
     stamp_of,
     within,
 )
+from tune_jobs.store.presence import is_file
 from tune_jobs.store.probe import Probe, probing
 from tune_jobs.store.record_files import dump, dump_sealed, read_record
 from tune_jobs.store.trial_store import TrialStore
@@ -89,11 +89,17 @@ class SweepStore:
         return self.folder.name
 
     def exists(self) -> bool:
-        """Whether there is a sweep here; one that this user may not read counts, and is refused when it is read."""
+        """Whether there is a sweep here; one that this user may not read counts, and is refused when it is read.
+
+        Raises:
+            CheckpointError: The storage gives no answer.
+        """
         try:
-            return self.record_path.is_file()
-        except PermissionError:
-            return True
+            return is_file(self.record_path)
+        except CheckpointError as error:
+            if isinstance(error.__cause__, PermissionError):
+                return True
+            raise
 
     def create(self) -> None:
         """Make the folder; of several processes that want the same name, one gets it.
@@ -103,8 +109,8 @@ class SweepStore:
             CannotRunError: The storage folder cannot be written.
         """
         root = self.folder.parent
-        self._made = [folder for folder in (root, *root.parents) if not folder.exists()]
         try:
+            self._made = [folder for folder in (root, *root.parents) if not folder.exists()]
             root.mkdir(parents=True, exist_ok=True)
             try:
                 self.folder.mkdir()
@@ -117,9 +123,8 @@ class SweepStore:
                 self.discard()
                 raise
         except OSError as error:
-            reason = os.strerror(error.errno) if error.errno else str(error)
             raise CannotRunError(
-                f"The storage folder {root} cannot be written: {reason}.",
+                f"The storage folder {root} cannot be written: {error.strerror or error}.",
                 "Choose another with --storage, or set TUNE_JOBS_STORAGE.",
             ) from error
 
@@ -137,13 +142,17 @@ class SweepStore:
             CannotRunError: A process drives the sweep, or the folder cannot be removed, such as a symbolic link.
         """
         refuse_linked_sweep(self.folder)
+        # Under its own name, what a kill leaves of it would hold that for ever.
+        hidden = self.folder.with_name(f".{self.name}.deleted")
         try:
             with self.lock():
+                remove_folder(hidden)
                 remove_file(self.record_path)
-                shutil.rmtree(self.folder)
+                shutil.rmtree(self.folder.replace(hidden))
         except OSError as error:
+            left = hidden if hidden.exists() else self.folder
             raise CannotRunError(
-                f"Sweep {self.name} cannot be removed as a whole: {error}.", f"Remove what is left of {self.folder}."
+                f"Sweep {self.name} cannot be removed as a whole: {error}.", f"Remove what is left of it: {left}."
             ) from error
 
     @contextlib.contextmanager
@@ -214,7 +223,7 @@ class SweepStore:
         """Read every trial's record, by index."""
         folders = parts_of(within(self.folder, names.TRIALS_FOLDER))
         stores = [self.trial(path.name) for path in folders if is_trial_id(path.name)]
-        records = [store.read_record() for store in stores if store.record_path.is_file()]
+        records = [store.read_record() for store in stores if is_file(store.record_path)]
         return sorted(records, key=lambda record: record.index)
 
     def trial_stamps(self) -> dict[str, tuple[int, ...]]:
@@ -232,7 +241,7 @@ class SweepStore:
             NotFoundError: No best policy has been chosen yet.
         """
         path = within(self.best_folder, names.BEST_RECORD)
-        if not path.is_file():
+        if not is_file(path):
             raise NotFoundError(
                 f"Sweep {self.name} has no best policy yet.",
                 f"Choose it with `tune-jobs best {name_in_commands(self.place)}`.",
@@ -241,7 +250,7 @@ class SweepStore:
 
     def has_best(self) -> bool:
         """Whether a best policy has been chosen."""
-        return (self.best_folder / names.BEST_RECORD).is_file()
+        return is_file(self.best_folder / names.BEST_RECORD)
 
     def best_stamp(self) -> tuple[int, ...]:
         """Return the inode, the size and the time of the winner's record."""
@@ -272,7 +281,7 @@ class SweepStore:
     def _are_of_the_winner(self, films: Iterable[Path]) -> bool:
         path = within(self.best_folder, names.FILMS_RECORD)
         try:
-            if path.is_file():
+            if is_file(path):
                 record = read_record(path, FilmsRecord, "films record", is_sealed=True)
                 return record.checkpoint == self.read_best().checkpoint
         except (CheckpointError, NotFoundError):

@@ -85,10 +85,10 @@ class Trial(Protocol):
         ...
 
     def settle(self) -> None:
-        """Wait until what this process has written here is kept for all; what is kept nearby is so at once.
+        """Wait until what this process has written here is kept for all, whatever becomes of this machine.
 
-        A store that is far away takes checkpoints and results in the background. A process calls this before it says
-        of a trial that it has ended, or is paused.
+        A store that is far away takes checkpoints and results in the background, and a disk takes results some seconds
+        after they were written. A process calls this before it says of a trial that it has ended, or is paused.
 
         Raises:
             OwnershipLostError: Another process has taken the trial; something was not kept.

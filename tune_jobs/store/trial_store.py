@@ -17,12 +17,21 @@ from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
 from policies.errors import CheckpointError
-from policies.files import open_to_append, write_atomic
+from policies.files import open_to_append, sync, write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
-from tune_jobs.store.manifests import files_of, read_manifest, verify_checkpoint, write_manifest
+from tune_jobs.store.manifests import files_of, read_manifest, sync_folder, verify_checkpoint, write_manifest
 from tune_jobs.store.ownership import OwnedFolder
-from tune_jobs.store.places import check_trial_id, checkpoint_iteration, make_folder, parts_of, remove_folder, within
+from tune_jobs.store.places import (
+    check_trial_id,
+    checkpoint_iteration,
+    make_folder,
+    names_in,
+    parts_of,
+    remove_folder,
+    within,
+)
+from tune_jobs.store.presence import is_link, is_there
 from tune_jobs.store.record_files import dump, read_record
 from tune_jobs.store.results_file import ResultsFile, Scored, read_results, read_scores
 from tune_jobs.store.results_tail import NewPoints, ResultsMark, read_new_points
@@ -89,7 +98,9 @@ class TrialStore(OwnedFolder):
         return record
 
     def settle(self) -> None:
-        """Do nothing: what was written is on disk."""
+        """Wait until the results are on disk, too: all else is there when it has been written."""
+        if is_there(self.results_path):
+            sync(self.results_path)
 
     def write_record(self, record: TrialRecord, *, soon: bool = False) -> None:  # noqa: ARG002 (never later here)
         """Replace trial.json."""
@@ -133,7 +144,7 @@ class TrialStore(OwnedFolder):
 
     def has_results(self) -> bool:
         """Whether there is a results.jsonl, with lines or without."""
-        return self.results_path.exists()
+        return is_there(self.results_path)
 
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
         """Replace results.jsonl by the lines up to the checkpoint that the trial continues from."""
@@ -201,6 +212,8 @@ class TrialStore(OwnedFolder):
             make_folder(temporary)
         try:
             write(temporary)
+            # Results come first, as a trial that goes on from this checkpoint counts on them.
+            self.settle()
             write_manifest(temporary, record, engine)
             with self.owned():
                 # It exists if the trial continued from an earlier checkpoint and writes this iteration anew.
@@ -209,6 +222,7 @@ class TrialStore(OwnedFolder):
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
+        sync(self.checkpoints_folder)  # as in `atomic_path`
 
     def delete_checkpoint(self, record: CheckpointRecord) -> None:
         """Remove a checkpoint: it is hidden first, then deleted.
@@ -240,11 +254,14 @@ class TrialStore(OwnedFolder):
             # Links are copied as links, which `verify_checkpoint` refuses, so that their targets are not copied.
             shutil.copytree(folder, temporary, symlinks=True)
             record = verify_checkpoint(temporary)
+            sync_folder(temporary)
             remove_folder(final)
             temporary.replace(final)
         except BaseException:
             remove_folder(temporary)
             raise
+        # With its name, as a record that says that the trial goes on from it comes next.
+        sync(self._copies_folder)
         return record
 
     def remove_copies(self, keep: Collection[int] = ()) -> None:
@@ -261,18 +278,18 @@ class TrialStore(OwnedFolder):
         """Move a checkpoint or a copy to damaged/; see `Trial.set_aside`."""
         target = within(self.folder, names.DAMAGED_FOLDER, f"{prefix}{path.name}")
         number = 1
-        while target.exists():
+        while is_there(target):
             number += 1
             target = target.with_name(f"{prefix}{path.name}-{number}")
         with self.owned():
             target.parent.mkdir(exist_ok=True)
-            if path.exists():
+            if is_there(path):
                 path.replace(target)
         return f"{names.DAMAGED_FOLDER}/{target.name}"
 
     def latest_damaged(self) -> int:
         """Return the latest iteration of the checkpoints that were set aside; 0 if there is none."""
-        found = [path.name.partition("-")[0] for path in (self.folder / names.DAMAGED_FOLDER).glob("[0-9]*")]
+        found = [name.partition("-")[0] for name in names_in(self.folder / names.DAMAGED_FOLDER)]
         return max((int(name) for name in found if name.isdecimal()), default=0)
 
     def append_events(self, name: str, data: bytes) -> None:
@@ -282,10 +299,9 @@ class TrialStore(OwnedFolder):
 
     def remove_leftovers(self) -> None:
         """Delete checkpoints that a killed process had written or deleted only in part."""
-        if self.checkpoints_folder.is_dir():
-            for folder in self.checkpoints_folder.iterdir():
-                if folder.name.startswith(".") and not folder.is_symlink():
-                    remove_folder(folder)
+        for folder in parts_of(self.checkpoints_folder):
+            if folder.name.startswith(".") and not is_link(folder):
+                remove_folder(folder)
 
     def forget_tally(self) -> None:
         """Delete the tally, because its numbers are in the record, or the trial is over.

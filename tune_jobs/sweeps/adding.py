@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from analysis.numbering import planned_places
-from analysis.records import FINISHED, TRAINING_LENGTH, ChosenPointRecord, SweepRecord, TrialRecord
+from analysis.records import FINISHED, FORMAT_VERSION, TRAINING_LENGTH, ChosenPointRecord, SweepRecord, TrialRecord
 from policies.errors import CannotRunError, CheckpointError, SpecError
 from policies.hyperparams import HYPERPARAMS_BY_ALGORITHM, Hyperparams
 from tune_jobs.plan.machine import Machine
@@ -154,7 +154,9 @@ def _add_trials(
     # The sweep's record comes first: if this process is killed then, trials are missing, which a resume adds. Trials
     # that the sweep's spec does not give would be refused for good.
     changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
-    store.write_record(record.model_copy(update={**changes, "state": "running"}))
+    # The spec is written with all fields of this version.
+    changes |= {"format_version": FORMAT_VERSION, "state": "running"}
+    store.write_record(record.model_copy(update=changes))
     for trial_record in todo:
         store.trial(trial_record.trial_id).write_record(trial_record, soon=True)
     store.settle()

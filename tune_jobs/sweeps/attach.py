@@ -17,6 +17,7 @@ from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import resume_command
+from tune_jobs.sweeps.confirm import what_is_left_out
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran, why_not_asked
 from tune_jobs.sweeps.forecast import caps_of
@@ -208,18 +209,26 @@ def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
     if page is not None:
         artifacts["report"] = page
     failed = is_whole and job is not None and job.driver_exit_code == 3
-    named = name_in_commands(store.place)
-    what = "the one there is was chosen before the sweep was trained on" if store.has_best() else "none was chosen"
-    why = f"{what}. `tune-jobs best {named}` does it, or says why not"
     return SweepResult(
         store.place,
         record,
         trials,
         best=best,
-        why_no_best=why if is_whole and best is None else None,
+        why_no_best=_why_no_best(store) if is_whole and best is None else None,
         artifacts=artifacts,
         interrupted=not is_whole,
         notes=notes_on_best(record, best),
         # Who leaves out what follows the trials has no report of them either.
         finish_failed=failed or (is_whole and best is None and page is not None),
     )
+
+
+def _why_no_best(store: Sweep) -> str:
+    """Return why a sweep whose trials are done has no best policy, and what gives it one."""
+    what = "the one there is was chosen before the sweep was trained on"
+    if not store.has_best():
+        what = "none was chosen"
+        # Killed between the trials and what follows them: a choice now would be by one seed of each setting.
+        if (left_out := what_is_left_out(store)) is not None:
+            return f"{what}, and {left_out.removesuffix('.')}"
+    return f"{what}. `tune-jobs best {name_in_commands(store.place)}` does it, or says why not"

@@ -29,6 +29,7 @@ from tune_jobs.store.candidates import leave_out, read_results, read_trials
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
+from tune_jobs.store.presence import is_file
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.drawing import ReportMatter, videos_of
 from tune_jobs.sweeps.drive import cpus_for_episodes
@@ -171,7 +172,7 @@ def find_policy(
     if is_checkpoint(path):
         verify_checkpoint(path)
         policy = load_policy(path)
-    elif path.is_file() or is_policy_folder(path):
+    elif is_file(path) or is_policy_folder(path):
         policy = load_policy(path)
     else:
         store, trial_id = _sweep_and_trial(text, storage)

@@ -7,16 +7,18 @@ race, and an equal spec and seed give an equal one.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from analysis.objectives import SettingScores, reached_goal
 from analysis.racing import Race, race_within
 from analysis.records import IterationRecord, ReplicationRecord, SweepRecord, TrialRecord
+from policies.errors import TuneJobsError
 from policies.portable.file import BASELINE_KINDS
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import resume_command
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.settings import ranked, threshold_for
 
@@ -43,15 +45,30 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
         return ()
     threshold = threshold_for(spec)
     with store.reading():
-        trials, results = read_trials(store), read_results(store)
+        trials, results = read_trials(store), read_results(store).lean()
 
     def ranked_of(known: Sequence[TrialRecord]) -> list[SettingScores]:
         return ranked(spec, known, results, threshold)
 
     race, before, num_done = race_under_way(spec, trials, rounds, ranked_of)
-    if race is None or are_all_alike([line for trial in before for line in results.get(trial.trial_id, ())]):
+    if race is None or are_all_alike(line for trial in before for line in results.get(trial.trial_id, ())):
         return ()
     return race.next_points(_scores(ranked_of(trials)), num_done)
+
+
+def what_is_left_out(store: Sweep) -> str | None:
+    """Return a sentence on more seeds that a sweep's `confirm` would give now, and how it does; None: it would not."""
+    try:
+        wanted = points_to_confirm(store)
+    except TuneJobsError:
+        # Who wants them is told what is wrong.
+        return None
+    if not wanted:
+        return None
+    command = resume_command(store, store.read_record())
+    settings = len(set(wanted))
+    told = f"the {settings} leading settings got no more seeds (confirm), as nothing followed the trials"
+    return f"{told}: `{command}` does both."
 
 
 def race_under_way(
@@ -85,7 +102,7 @@ def _scores(settings: Sequence[SettingScores]) -> dict[int, Sequence[float]]:
     return {item.point_index: item.scores for item in settings}
 
 
-def are_all_alike(results: Sequence[IterationRecord]) -> bool:
+def are_all_alike(results: Iterable[IterationRecord]) -> bool:
     """Whether trials were evaluated and all episodes of all of them, those of training too, had the same return.
 
     That is how it looks where nothing was learned, as on MountainCar in too short a training: no setting leads, and to
@@ -94,14 +111,17 @@ def are_all_alike(results: Sequence[IterationRecord]) -> bool:
     Args:
         results: Of all trials of the search.
     """
-    if all(line.evaluation_return is None for line in results):
-        return False
+    first: float | None = None
+    is_evaluated = False
     # Most end with the second of them: nothing is gathered, as there may be millions.
-    returns = (
-        value for line in results for value in (line.evaluation_return, *line.episode_returns) if value is not None
-    )
-    first = next(returns)
-    return all(value == first for value in returns)
+    for line in results:
+        is_evaluated = is_evaluated or line.evaluation_return is not None
+        for value in (line.evaluation_return, *line.episode_returns):
+            if first is None:
+                first = value
+            elif value is not None and value != first:
+                return False
+    return is_evaluated
 
 
 def different_points(settings: Sequence[SettingScores]) -> list[int]:

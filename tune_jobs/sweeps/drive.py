@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
 import subprocess
 import sys
@@ -33,6 +32,7 @@ from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.forecast import caps_of
+from tune_jobs.sweeps.importing import import_what_runs_trials, importing_what_follows
 from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.reached import reached_of
@@ -96,13 +96,7 @@ def connected(address: str | None, here: Machine | None, *, packs: bool = False)
         check_address(address)
     from tune_jobs.ray_tune.cluster import connect
 
-    return connect(address, here, packs=packs, meanwhile=_import_what_runs_trials)
-
-
-def _import_what_runs_trials() -> None:
-    """Import Ray Tune and what is built on it. What can't be imported is an error where it is needed."""
-    with contextlib.suppress(Exception):
-        importlib.import_module("tune_jobs.ray_tune.run_trials")
+    return connect(address, here, packs=packs, meanwhile=import_what_runs_trials)
 
 
 def packs_begun_ahead(spec: SweepSpec, here: Machine | None) -> AbstractContextManager[None]:
@@ -326,14 +320,15 @@ def _run_trials(
                 more_packs=0 if address is None else packs_for_more_nodes(store, plan.packs),
                 run=run.token,
             )
+            listener = importing_what_follows(monitor)
             monitor.phase = "starting the trials"
             try:
                 if shared.connection.is_client:
                     from tune_jobs.ray_tune.driver_actor import run_trials_remotely
 
-                    run_trials_remotely(job, monitor.update)
+                    run_trials_remotely(job, listener)
                 else:
-                    run_trials(job, monitor.update)
+                    run_trials(job, listener)
             except CannotRunError:
                 # A signal to the whole process group ends Ray's processes too, which is not a failure of Ray.
                 if not current().came:

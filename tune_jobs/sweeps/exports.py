@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from analysis.exports.frames import ROWS, Rows, SweepData
 from policies.arguments import Inches, PositiveInt, checked
 from policies.errors import CannotRunError, SpecError
+from policies.files import is_output_folder
 from tune_jobs.sweeps.gathered import spec_of, sweep_data
 from tune_jobs.sweeps.storage import local_path
 
@@ -154,7 +156,7 @@ def export(
     store = find_sweep(names[0], storage)
     suffix = _SUFFIXES.get(kind, f"-{kind}")
     path = Path(f"{store.name}{suffix}") if output is None else local_path(output)
-    if kind in _SUFFIXES and path.is_dir():
+    if kind in _SUFFIXES and is_output_folder(path):
         path /= f"{store.name}{suffix}"
     elif kind in _SUFFIXES and path.suffix.lower() != suffix:
         path = path.with_name(f"{path.name}{suffix}")
@@ -226,8 +228,8 @@ def _labels(stores: Sequence[Sweep]) -> list[str]:
     """Return what sweeps are called beside each other: by their names, or by their places where names are the same."""
     from analysis.wording import shown_path
 
-    names = [store.name for store in stores]
-    return [store.name if names.count(store.name) == 1 else shown_path(store.place) for store in stores]
+    given = Counter(store.name for store in stores)
+    return [store.name if given[store.name] == 1 else shown_path(store.place) for store in stores]
 
 
 def _write_latex(store: Sweep, path: Path, top: int | None) -> Path:
@@ -255,19 +257,21 @@ def _write_whole(store: Sweep, path: Path) -> Path:
 
 def _write_tables(data: SweepData, folder: Path, kind: str) -> dict[str, Path]:
     from analysis.exports.frames import flat, make_frame
+    from analysis.iterations_csv import write_iterations
     from analysis.tables import write_csv
     from policies.files import write_atomic
 
-    if folder.exists() and not folder.is_dir():
+    if not is_output_folder(folder) and folder.exists():
         raise CannotRunError(f"{folder} is a file; {kind} writes a folder of tables.", "Give a folder.")
     written: dict[str, Path] = {}
     for rows in ROWS:
         path = folder / f"{rows}.{kind}"
-        frame = make_frame(data, rows)
-        if kind == "csv":
-            write_csv(path, frame)
+        if kind != "csv":
+            write_atomic(path, flat(make_frame(data, rows)).to_parquet(index=False))
+        elif rows == "iterations":
+            write_iterations(path, data.results)
         else:
-            write_atomic(path, flat(frame).to_parquet(index=False))
+            write_csv(path, make_frame(data, rows))
         written[rows] = path
     return written
 

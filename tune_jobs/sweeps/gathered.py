@@ -37,6 +37,7 @@ def sweep_data(store: Sweep) -> SweepData:
         num_env_steps=spec.stop.num_env_steps,
         threshold=goal_of(store.read_record(), best),
         has_settings=not spec.scheduler.is_population,
+        num_iterations=spec.stop.num_iterations,
     )
 
 

@@ -46,7 +46,10 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _is_sweep(path: Path) -> bool:
-    if not path.is_dir():
+    try:
+        if not path.is_dir():
+            return False
+    except OSError:  # who cannot look at it has been told so
         return False
     try:
         from tune_jobs.store.opening import open_sweep

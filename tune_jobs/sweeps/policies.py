@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from analysis.best_records import BestRecord, EvaluationRecord
 from policies.arguments import NumEpisodes, Seed, checked
 from policies.envs.modules import allowed_again
-from policies.files import expanded
+from policies.files import expanded, is_output_folder
 from policies.guard.guard import guarding
 from tune_jobs.sweeps.outcome import Progress
 from tune_jobs.sweeps.results import Films
@@ -145,7 +145,7 @@ def _film_path(output: str | Path | None, name: str) -> Path:
     if output is None:
         return Path(name)
     path = expanded(output)
-    if str(output).endswith("/") or path.is_dir():
+    if str(output).endswith("/") or is_output_folder(path):
         return path / name
     # Another suffix, such as that of `cartpole-v0.5`, is kept.
     return path if path.suffix.lower() in (".mp4", ".gif") else path.with_name(f"{path.name}.mp4")

@@ -15,6 +15,7 @@ from tune_jobs.spec.sections import NAME_PATTERN
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import leave_out
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import is_same_place
 from tune_jobs.sweeps.sources import find_sweep
 
 
@@ -28,10 +29,11 @@ def read_priors(spec: SweepSpec, storage: str | Path | None, *, by_name: bool = 
 
     Raises:
         NotFoundError: There is no such sweep.
-        SpecError: One is of another algorithm or space, or tells nothing, or is named by its place where that is not
-            allowed.
+        SpecError: One is of another algorithm or space, or tells nothing, or is named twice, or is named by its place
+            where that is not allowed.
     """
     found = []
+    places: dict[str, str] = {}
     for sweep in spec.prior:
         if by_name and re.fullmatch(NAME_PATTERN, sweep) is None:
             raise SpecError(
@@ -42,6 +44,9 @@ def read_priors(spec: SweepSpec, storage: str | Path | None, *, by_name: bool = 
             store = find_sweep(sweep, storage)
         except NotFoundError as error:
             raise NotFoundError(f"prior: {error.message}", error.hint) from error
+        if same := [other for other, place in places.items() if is_same_place(place, store.place)]:
+            raise SpecError(f"prior: {shortened(same[0])} and {shortened(sweep)} are the same sweep.", "Name it once.")
+        places[sweep] = store.place
         record = store.read_record()
         earlier = stored_spec(record)
         found.append(prior_record(spec, store.name, earlier, _judged(store, earlier, record.env_threshold)))
@@ -75,8 +80,9 @@ def _judged(store: Sweep, earlier: SweepSpec, env_threshold: float | None) -> li
                     leave_out(error)
                     results = []
                 score = score_of(
-                    trial, results, objective, num_env_steps=earlier.stop.num_env_steps, threshold=threshold
-                )
+                    trial, results, objective, num_env_steps=earlier.stop.num_env_steps,
+                    num_iterations=earlier.stop.num_iterations, threshold=threshold,
+                )  # fmt: skip
             judged.append(trial.model_copy(update={"objective_score": score}))
     return judged
 

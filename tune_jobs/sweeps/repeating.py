@@ -10,7 +10,7 @@ from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.plan.machine import Machine
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.spec.engines import engine_named
-from tune_jobs.spec.sweep_spec import SweepSpec
+from tune_jobs.spec.sweep_spec import SweepSpec, check_trainable
 
 
 def check_takes_more(record: SweepRecord) -> None:
@@ -37,9 +37,11 @@ def plan_of_repetition(spec: SweepSpec, trial: TrialRecord, record: SweepRecord,
         machine: What it runs on.
 
     Raises:
+        SpecError: An older version launched the sweep with a setting that is refused now.
         CannotRunError: The trial needs more than the machine has.
         EnvError: The environment can't be made.
     """
+    check_trainable(spec)
     cpus, gpus = spec.cpus_per_trial, spec.resources.num_gpus
     if machine.fitting(cpus, gpus) < 1:
         raise CannotRunError(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import cast
 
 from analysis.comparison.repetition import Changed, Repetition, causes, first_difference
-from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialPlan, TrialRecord
+from analysis.records import FORMAT_VERSION, CheckpointRecord, IterationRecord, SweepRecord, TrialPlan, TrialRecord
 from analysis.selection import error_summary
 from analysis.wording import counted
 from policies.arguments import checked
@@ -156,8 +156,9 @@ def _write(again: Sweep, sweep: SweepRecord, spec: SweepSpec, trial: TrialRecord
     again.write_record(
         sweep.model_copy(
             update={
-                "name": again.name, "state": "created", "spec": spec.model_copy(update=changes).model_dump(mode="json"),
-                "num_trials": 1, "created_at": time.time(), "started_at": None, "ended_at": None, "run_time_s": 0.0,
+                "format_version": FORMAT_VERSION, "name": again.name, "state": "created",
+                "spec": spec.model_copy(update=changes).model_dump(mode="json"), "num_trials": 1,
+                "created_at": time.time(), "started_at": None, "ended_at": None, "run_time_s": 0.0,
                 "versions": versions(), "git_commit": git_commit(), "address": None, "job": None,
                 "waiting": None, "replications": (), "repeats": f"{sweep.name}/{trial.trial_id}",
             }

@@ -11,6 +11,7 @@ from analysis.records import FINISHED, ReplicationRecord
 from policies.envs.modules import allow_modules
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine
+from tune_jobs.process.ran_with import versions
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.rules import check_extendable, check_replicable
 from tune_jobs.store.command_names import name_in_commands
@@ -120,11 +121,13 @@ def _taken_over(
 ) -> Iterator[tuple[Machine | None, Machine, tuple[str, ...]]]:
     """Hold the sweep's lock for the block; `more` trials than those that are not finished may come to the sweep in it.
 
-    It gives the machine to start Ray on, if any, what the sweep runs on, and notes on its nodes.
+    It gives the machine to start Ray on, if any, what the sweep runs on, and notes on its nodes and on its version.
     """
     check_wait(address, wait_for_nodes)
     with contextlib.ExitStack() as stack:
         stack.enter_context(store.lock())
+        # Before anything is written: what this version does not accept is another's, which goes on with it.
+        stored_spec(store.read_record())
         # The request was for a process that was killed.
         store.clear_stop_request()
         stack.enter_context(settled(store))
@@ -137,7 +140,7 @@ def _taken_over(
             note_wait(store, None)
             if more or any(trial.status not in FINISHED for trial in store.read_trials()):
                 stack.enter_context(packs_begun_ahead(stored_spec(store.read_record()), machine))
-            yield machine, machine, ()
+            yield machine, machine, _notes_on_version(store)
             return
         connection = stack.enter_context(connected(address, None))
         from tune_jobs.ray_tune.node_checks import check_nodes
@@ -145,4 +148,17 @@ def _taken_over(
         found = machine_that_fits(store, connection, wait_for_nodes, progress=progress)
         record = store.read_record()
         num_gpus = stored_spec(record).resources.num_gpus
-        yield None, found, check_nodes(store.place, record.allowed_modules, num_gpus=num_gpus)
+        notes = check_nodes(store.place, record.allowed_modules, num_gpus=num_gpus)
+        yield None, found, (*notes, *_notes_on_version(store))
+
+
+def _notes_on_version(store: Sweep) -> tuple[str, ...]:
+    """Return the note on a sweep that another version of tune-jobs began; empty if it was this one, or is not known."""
+    began, here = (found.get("tune-jobs") for found in (store.read_record().versions, versions()))
+    if None in (began, here) or began == here:
+        return ()
+    note = (
+        f"The sweep was begun with tune-jobs {began}, and what is left of it trains as tune-jobs {here} does: with "
+        'other numbers than trials that ended before, where the changelog says so under "Changes results".'
+    )
+    return (note,)

@@ -38,8 +38,8 @@ def judged(
     if spec.objective.type == "steps_to_threshold" and goal is None:
         return None
     return judge_settings(
-        trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal,
-        cost=spec.objective.cost,
+        trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps,
+        num_iterations=spec.stop.num_iterations, threshold=goal, cost=spec.objective.cost,
     )  # fmt: skip
 
 
@@ -51,7 +51,10 @@ def ranked(
 ) -> list[SettingScores]:
     """Return all settings of a sweep with their scores, best first; the arguments are those of `judged`."""
     goal = goal_of(spec, threshold)
-    return rank_settings(trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps, threshold=goal)
+    return rank_settings(
+        trials, results, spec.objective.type, num_env_steps=spec.stop.num_env_steps,
+        num_iterations=spec.stop.num_iterations, threshold=goal,
+    )  # fmt: skip
 
 
 def threshold_for(spec: SweepSpec) -> float | None:

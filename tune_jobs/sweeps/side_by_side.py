@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -87,7 +88,7 @@ def check_comparable(stores: Sequence[Sweep]) -> None:
         NotFoundError: There is no such sweep.
     """
     names = [store.name for store in stores]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    if twice := sorted(name for name, times in Counter(names).items() if times > 1):
         raise SpecError(f"{twice[0]} was named twice: there is nothing to compare.", "Name different sweeps.")
     if not 2 <= len(stores) <= MAX_SWEEPS:
         raise SpecError(

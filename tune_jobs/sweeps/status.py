@@ -58,6 +58,8 @@ class SweepStatus:
     """An estimate of the seconds until all trials have ended; None: not known, or nothing runs."""
     best: BestSoFar | None = None
     """None: no trial has been evaluated yet, or none that was may win."""
+    lacks_seeds: bool = field(default=False, compare=False, metadata={"json": None})
+    """Whether its trials are done and no policy was chosen, before which its leading settings get more seeds."""
     place: str | None = field(default=None, compare=False, metadata={"json": None})
     """The folder or URL by which commands find it here; None: they find it by its name, as at a service."""
 
@@ -119,7 +121,7 @@ class SweepStatus:
     def _time_left(self, program: str) -> str:
         if not self.alive:
             if self.sweep.state == "completed":
-                return ""
+                return self._what_is_left(program) if self.lacks_seeds else ""
             verb = "starts" if self.sweep.state == "created" else "continues"
             return f"nothing runs; `{self._how_to_resume(program)}` {verb} it"
         if self.sweep.state == "completed":
@@ -129,6 +131,10 @@ class SweepStatus:
         if self.time_left_s is None:
             return self._why_unknown()
         return f"about {duration(self.time_left_s, tenths=False, none=PLAIN_NONE)}"
+
+    def _what_is_left(self, program: str) -> str:
+        told = "more seeds for its leading settings (confirm), and the best policy"
+        return f"nothing runs; `{self._how_to_resume(program)}` does what follows the trials: {told}"
 
     def _how_to_resume(self, program: str) -> str:
         if self.place is None:
@@ -163,7 +169,8 @@ class SweepStatus:
         return f"{duration(before, none=PLAIN_NONE)} before this run"
 
     def __repr__(self) -> str:
-        told = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in ("sweep", "place")}
+        hidden = ("sweep", "lacks_seeds", "place")
+        told = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in hidden}
         return brief_repr("SweepStatus", name=self.sweep.name, state=self.state, **told)
 
     def _repr_html_(self) -> str:
@@ -266,6 +273,7 @@ def status_of(
         record, trials = record.model_copy(update={"state": "interrupted"}), as_left(trials)
     counts = Counter(trial.status for trial in trials)
     so_far = _forecast(record, trials, alive=alive)
+    best = _confirmed(store, record, trials) or _best(trials)
     return SweepStatus(
         record,
         dict(counts),
@@ -274,7 +282,8 @@ def status_of(
         max_env_steps=None if so_far is None else so_far.max_env_steps,
         env_steps_per_s=None if so_far is None else so_far.env_steps_per_s,
         time_left_s=None if so_far is None else so_far.time_left_s,
-        best=_confirmed(store, record, trials) or _best(trials),
+        best=best,
+        lacks_seeds=not alive and best is not None and _lacks_seeds(store, record),
     )
 
 
@@ -300,6 +309,21 @@ def _confirmed(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord])
         return None
     at = best.checkpoint
     return BestSoFar(at.trial_id, at.iteration, at.num_env_steps, best.point, best.seed, best.selection_score)
+
+
+def _lacks_seeds(store: Sweep, record: SweepRecord) -> bool:
+    """Whether a sweep was ended between its trials and its `confirm`, as far as its record alone tells."""
+    from tune_jobs.plan.points import num_points_of
+    from tune_jobs.sweeps.confirm import largest_race
+
+    if record.state != "completed" or record.replications or store.has_best():
+        return False
+    try:
+        spec = stored_spec(record)
+        return largest_race(spec, num_points_of(spec, record.chosen_points)) is not None
+    except CheckpointError:
+        # The status of a sweep of another version is still told.
+        return False
 
 
 def _best(trials: Sequence[TrialRecord]) -> BestSoFar | None:

@@ -22,6 +22,7 @@ from policies.packed.stack import AnyStack
 from policies.packed.state import STATE_FOLDER, save_member
 from policies.portable.file import PortablePolicy
 from tune_jobs.plan.engine_choice import pack_key
+from tune_jobs.plan.estimates import most_env_steps_until
 from tune_jobs.training.devices import device_for
 from tune_jobs.training.packed_restore import restored_member
 from tune_jobs.training.protocol import IterationStats, TrialTask
@@ -80,7 +81,7 @@ class PackedEngine:
                 # Other seeds than at the trial's start, because its environments begin new episodes.
                 env_seed = random_streams.member_env_seed_after(task.seed, before[1] + member.num_iterations)
             member.failure_penalty, member.atari_training = task.failure_penalty, task.atari_training
-            stack.add(member, env_seed)
+            stack.add(member, env_seed, _max_env_steps(task, hyperparams))
         except BaseException:
             if is_new:
                 stack.envs.close()
@@ -165,7 +166,8 @@ class PackedEngine:
                 self._stacks[new] = self._make_stack(
                     task, member.hyperparams, self._device or device_for(task.num_gpus)
                 )
-            self._stacks[new].add(member, random_streams.member_env_seed_after(task.seed, self._done(member)[1]))
+            env_seed = random_streams.member_env_seed_after(task.seed, self._done(member)[1])
+            self._stacks[new].add(member, env_seed, _max_env_steps(task, member.hyperparams))
             self._tasks[trial_id] = (task, new)
         self.moved = (*self.moved, *trial_ids)
 
@@ -214,3 +216,7 @@ class PackedEngine:
     def _member_of(self, trial_id: str) -> tuple[TrialTask, AnyStack]:
         task, key = self._tasks[trial_id]
         return task, self._stacks[key]
+
+
+def _max_env_steps(task: TrialTask, hyperparams: TrainedHyperparams) -> int:
+    return most_env_steps_until(task.stop, hyperparams, num_env_runners=0)

@@ -21,6 +21,7 @@ from policies.rllib.dqn_algorithm import ReplayDQN
 from policies.rllib.env_runner import ArrayEnvRunner
 from policies.rllib.restore import portable_policy, restore_algorithm, take_over_state
 from policies.rllib.runner_errors import as_raised_there
+from tune_jobs.plan.estimates import most_env_steps_until
 from tune_jobs.plan.machine import usable_cpus
 from tune_jobs.training.devices import device_for
 from tune_jobs.training.env_runner import EnvRunner
@@ -104,6 +105,8 @@ class RLlibEngine:
             self._before = (task.num_env_steps - self._num_env_steps(), task.num_iterations - self._algorithm.iteration)
         if checkpoint is not None:
             self._continue_streams(checkpoint)
+        if isinstance(hyperparams, DQNHyperparams):
+            self._algorithm.replay.expect(most_env_steps_until(task.stop, hyperparams, task.num_env_runners))
 
     def _new_algorithm(self, task: TrialTask, hyperparams: TrainedHyperparams) -> RLlibAlgorithm:
         config = build_algorithm_config(

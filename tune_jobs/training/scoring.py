@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from analysis.objectives import score_so_far
-from analysis.records import IterationRecord, Objective, SweepRecord, length_of
+from analysis.records import IterationRecord, Objective, SweepRecord, whole_length
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.progress import Progress
 
@@ -29,17 +29,23 @@ class Judging:
     """Whether a scheduler may end it after any evaluation; otherwise only its end is judged."""
 
 
-def judging_of(spec: SweepSpec, sweep: SweepRecord, point: Mapping[str, Any]) -> Judging | None:
+def judging_of(
+    spec: SweepSpec, sweep: SweepRecord, point: Mapping[str, Any], hyperparams: Mapping[str, Any] | None = None
+) -> Judging | None:
     """Return how a trial is judged where a search method learns its score; None: none does, or can.
 
     Args:
         spec: The sweep.
         sweep: Its record, which has the env's own threshold.
         point: The trial's searched values, of which one may be how long it trains.
+        hyperparams: All of its hyperparameters; None: it is judged as if `stop.num_env_steps` alone ended it.
     """
     objective, all_steps, compares = spec.objective, spec.stop.num_env_steps, spec.scheduler.type != "none"
     if spec.search.has_model and objective.type == "area":
-        return Judging("area", length_of(point, all_steps), at_evaluations=compares)
+        length = whole_length(
+            point, hyperparams or {}, num_env_steps=all_steps, num_iterations=spec.stop.num_iterations
+        )
+        return Judging("area", length, at_evaluations=compares)
     # A record of a former version may not know the env's own.
     threshold = sweep.env_threshold if objective.threshold is None else objective.threshold
     if spec.search.has_model and objective.type == "steps_to_threshold" and threshold is not None:

@@ -24,7 +24,6 @@ from policies.files import write_plain
 from policies.portable.file import save_policy
 from tune_jobs.process.ran_with import ran_with
 from tune_jobs.store.contract import Ownership
-from tune_jobs.store.copies import pending_copy
 from tune_jobs.store.logs import built_from
 from tune_jobs.store.names import RESULTS
 from tune_jobs.store.opening import open_sweep
@@ -144,10 +143,8 @@ class TrialSteps:
         self._best = best_checkpoint(self._checkpoints)
         latest = self._checkpoints[-1] if self._checkpoints else None
         change = self.task.changes[-1] if self.task.changes else None
-        folder = pending_copy(self._store, change, latest.iteration if latest is not None else 0)
-        if folder is not None:
-            folder, notes = take_up_copy(self._store, folder)
-            self._notes += notes
+        folder, notes = take_up_copy(self._store, change, latest.iteration if latest is not None else 0)
+        self._notes += notes
         self._is_copy = folder is not None
         start = latest
         if folder is not None and change is not None:
@@ -270,12 +267,14 @@ class TrialSteps:
             progress = self._progress("failed", evaluated=False, error=text)
             counts = {"num_env_steps": reached.num_env_steps, "num_episodes": reached.num_episodes}
             return progress.model_copy(update=counts)
+        # With its evaluation, which may be what takes it to `time_s`.
+        record = record.model_copy(update={"time_s": self._clock() - self._started})
         if evaluation is not None:
             score = finite_or_none(sum(evaluation.returns) / len(evaluation.returns))
             record = record.model_copy(update={"evaluation_return": score})
             self._evaluation_return = score
             reason = reason or self._stop_reason(record, score)
-        self._last = record.model_copy(update={"time_s": self._clock() - self._started})
+        self._last = record
         self._unwritten.append(self._last)
         self._untold.append(self._last)
         self._score.add(self._last)

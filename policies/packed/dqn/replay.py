@@ -60,9 +60,15 @@ class StackedReplay:
         self._next: Indices = np.zeros(0, dtype=np.int64)
         self._size: Indices = np.zeros(0, dtype=np.int64)
 
-    def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
-        """Make room for a member's transitions, as many as its own memory holds."""
-        slot, capacity = self._free_slot(), self._capacity_of(hyperparams)
+    def add_member(self, member_id: str, hyperparams: DQNHyperparams, most: int | None = None) -> None:
+        """Make room for a member's transitions, as many as its own memory holds.
+
+        Args:
+            member_id: The member.
+            hyperparams: Its own.
+            most: The most transitions that it will ever have; None: not known.
+        """
+        slot, capacity = self._free_slot(), self._capacity_of(hyperparams, most)
         start = self._free_rows(capacity)
         if slot == len(self._start):
             for name in ("_start", "_capacity", "_next", "_size"):
@@ -70,8 +76,10 @@ class StackedReplay:
         self._slots[member_id] = slot
         self._start[slot], self._capacity[slot], self._next[slot], self._size[slot] = start, capacity, 0, 0
 
-    def _capacity_of(self, hyperparams: DQNHyperparams) -> int:
-        return hyperparams.train_batch_size if self._newest_only else hyperparams.replay_capacity
+    def _capacity_of(self, hyperparams: DQNHyperparams, most: int | None) -> int:
+        if self._newest_only:
+            return hyperparams.train_batch_size
+        return hyperparams.replay_capacity if most is None else min(hyperparams.replay_capacity, most)
 
     def _free_slot(self) -> int:
         return min(set(range(len(self._slots) + 1)) - set(self._slots.values()))
@@ -197,10 +205,10 @@ class StackedPrioritizedReplay(StackedReplay):
         self._epsilon: NDArray[np.float64] = np.zeros(0)
 
     @override
-    def add_member(self, member_id: str, hyperparams: DQNHyperparams) -> None:
+    def add_member(self, member_id: str, hyperparams: DQNHyperparams, most: int | None = None) -> None:
         # Before anything else is changed, as there may be too little memory for it.
-        self._make_tree(self._free_slot(), self._capacity_of(hyperparams))
-        super().add_member(member_id, hyperparams)
+        self._make_tree(self._free_slot(), self._capacity_of(hyperparams, most))
+        super().add_member(member_id, hyperparams, most)
         slot = self._slots[member_id]
         if slot == len(self._highest):
             for name in ("_highest", "_alpha", "_beta", "_epsilon"):

@@ -64,10 +64,10 @@ class DQNStack(Stack[DQNHyperparams, DQNGroup, SharedByDQN]):
         self._stats: dict[str, MemberStats] = {}
         self._num_actions = int(cast("gym.spaces.Discrete[Any]", envs.action_space).n)
 
-    def _begin(self, member: Member[DQNHyperparams]) -> None:
+    def _begin(self, member: Member[DQNHyperparams], max_env_steps: int | None) -> None:
         """Make room for the member's transitions."""
         hyperparams = member.hyperparams
-        self._replay.add_member(member.member_id, hyperparams)
+        self._replay.add_member(member.member_id, hyperparams, max_env_steps)
         self._n_step.add_member(member.member_id, hyperparams)
         if member.num_updates and self._shared.replay != "none":
             # Its memory is empty again. It is filled to where it was when learning began; until then nothing is learnt.

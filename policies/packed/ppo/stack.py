@@ -84,7 +84,7 @@ class PPOStack(Stack[PPOHyperparams, PPOGroup, SharedByPPO]):
         self._num_outputs = self._num_actions * (2 if self._is_gaussian else 1)
 
     @override
-    def _begin(self, member: Member[PPOHyperparams]) -> None:
+    def _begin(self, member: Member[PPOHyperparams], max_env_steps: int | None) -> None:
         if member.hyperparams.normalize_rewards:
             self._returns[member.member_id] = np.zeros(self.envs.num_envs)
 

@@ -85,9 +85,10 @@ class Bucket:
         self.url = url
         # For those who wait, and for those who want an answer now.
         self._opened: dict[bool, obstore.store.ObjectStore] = {}
+        self._before = f"{url.prefix}/" if url.prefix else ""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"url": self.url, "_opened": {}}
+        return {**self.__dict__, "_opened": {}}
 
     @property
     def _store(self) -> obstore.store.ObjectStore:
@@ -96,6 +97,15 @@ class Bucket:
         if now not in self._opened:
             self._opened[now] = clients.client_of(self.url, now=now)
         return self._opened[now]
+
+    def _path(self, key: str) -> str:
+        """Return where an object is in the bucket: its connections know of no address within it."""
+        # A slash at the beginning is none of the key's, for obstore.
+        return self._before + key.removeprefix("/")
+
+    def _listed(self, meta: Any) -> Listed:
+        key = meta["path"].removeprefix(self._before)
+        return Listed(key, meta["size"], _tag(meta), meta["last_modified"].timestamp())
 
     def get(self, key: str) -> Found | None:
         """Return an object; None: there is none.
@@ -107,7 +117,7 @@ class Bucket:
 
         def read() -> Found | None:
             try:
-                answer = obstore.get(self._store, key)
+                answer = obstore.get(self._store, self._path(key))
             except FileNotFoundError as error:
                 self._refuse_missing_bucket(error)
                 return None
@@ -135,7 +145,7 @@ class Bucket:
 
         def ask() -> Listed | None:
             try:
-                return _listed(obstore.head(self._store, key))
+                return self._listed(obstore.head(self._store, self._path(key)))
             except FileNotFoundError:
                 # The answer has no body that says whether it is the object or the bucket that is missing.
                 self.get(key)
@@ -154,7 +164,7 @@ class Bucket:
 
         def read() -> bool:
             try:
-                answer = obstore.get(self._store, key)
+                answer = obstore.get(self._store, self._path(key))
             except FileNotFoundError as error:
                 self._refuse_missing_bucket(error)
                 return False
@@ -197,7 +207,7 @@ class Bucket:
             try:
                 # In one request: a content in parts has no conditions.
                 in_parts = False if over or is_new else None
-                return _tag(obstore.put(self._store, key, data, mode=mode, use_multipart=in_parts))
+                return _tag(obstore.put(self._store, self._path(key), data, mode=mode, use_multipart=in_parts))
             except (AlreadyExistsError, PreconditionError) as error:
                 if not (over or is_new) or "RequestConflict" in str(error):
                     # Two writes at once: the store has done neither, perhaps.
@@ -258,15 +268,15 @@ class Bucket:
         for begin in range(0, len(wanted), _MAX_DELETED):
             part = wanted[begin : begin + _MAX_DELETED]
 
-            def remove(part: list[str] = part) -> None:
+            def remove(paths: Sequence[str] = tuple(map(self._path, part))) -> None:
                 try:
-                    obstore.delete(self._store, part)
+                    obstore.delete(self._store, paths)
                 except FileNotFoundError as error:
                     self._refuse_missing_bucket(error)
                     # Stores that remove one after the other stop at one that is missing.
-                    for name in part:
+                    for path in paths:
                         with contextlib.suppress(FileNotFoundError):
-                            obstore.delete(self._store, name)
+                            obstore.delete(self._store, path)
 
             self._doing("removed", part[0], remove)
 
@@ -279,8 +289,8 @@ class Bucket:
         import obstore
 
         def look() -> list[Listed]:
-            pages = obstore.list(self._store, prefix or None)
-            return sorted((_listed(item) for page in pages for item in page), key=lambda item: item.key)
+            pages = obstore.list(self._store, self._path(prefix) or None)
+            return sorted((self._listed(item) for page in pages for item in page), key=lambda item: item.key)
 
         return self._doing("listed", prefix, look)
 
@@ -293,9 +303,9 @@ class Bucket:
         import obstore
 
         def look() -> tuple[list[str], list[Listed]]:
-            found = obstore.list_with_delimiter(self._store, prefix or None)
+            found = obstore.list_with_delimiter(self._store, self._path(prefix) or None)
             names = sorted(path.rstrip("/").rpartition("/")[2] for path in found["common_prefixes"])
-            return names, sorted((_listed(item) for item in found["objects"]), key=lambda item: item.key)
+            return names, sorted((self._listed(item) for item in found["objects"]), key=lambda item: item.key)
 
         return self._doing("listed", prefix, look)
 
@@ -348,7 +358,3 @@ class Bucket:
 
 def _tag(meta: Any) -> Tag:
     return meta.get("e_tag"), meta.get("version")
-
-
-def _listed(meta: Any) -> Listed:
-    return Listed(meta["path"], meta["size"], _tag(meta), meta["last_modified"].timestamp())

@@ -1,4 +1,4 @@
-"""The connections of a process to object stores: one set for each address, and for those who want an answer now."""
+"""The connections of a process to object stores: one set for each bucket, and for those who want an answer now."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ REQUEST_TIMEOUT_S = 30.0
 PATIENCE_S = 30.0
 """Seconds in which requests that failed for reasons that pass are repeated."""
 _MAX_CLIENTS = 32
-"""Addresses whose connections a process keeps: they are the same for all that it has open there."""
+"""Buckets whose connections a process keeps: they are the same for all sweeps that it has open there."""
 
 
 def client_of(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
-    """Return this process's connections to a store; `now`: of those who want an answer now."""
+    """Return this process's connections to an address's bucket; `now`: of those who want an answer now."""
     # What it was made from: a forked process has none of its parent's threads, and each has its credentials from there.
     told = tuple(item for item in sorted(os.environ.items()) if item[0].startswith(("AWS_", "GOOGLE_", "AZURE_")))
-    return _client_of(os.getpid(), str(url), told, now=now)
+    # Not for each sweep: to make them takes milliseconds and a new connection, and a service has thousands of sweeps.
+    bucket = ObjectUrl(url.scheme, url.bucket, "", url.settings)
+    return _client_of(os.getpid(), str(bucket), told, now=now)
 
 
 @functools.lru_cache(maxsize=_MAX_CLIENTS)
@@ -38,7 +40,6 @@ def _client_of(
 def _open(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
     from obstore.store import AzureStore, GCSStore, S3Store
 
-    prefix = url.prefix or None
     options: dict[str, Any] = {
         "client_options": {
             "timeout": timedelta(seconds=REQUEST_TIMEOUT_S),
@@ -59,13 +60,13 @@ def _open(url: ObjectUrl, *, now: bool) -> obstore.store.ObjectStore:
             options |= {"endpoint": endpoint, "virtual_hosted_style_request": False, "region": "us-east-1"}
         if region := url.settings.get("region"):
             options["region"] = region
-        return S3Store(url.bucket, prefix=prefix, **options)
+        return S3Store(url.bucket, **options)
     if url.scheme == "gs":
         if endpoint:
             options["base_url"] = endpoint
-        return GCSStore(url.bucket, prefix=prefix, **options)
+        return GCSStore(url.bucket, **options)
     if account := url.settings.get("account"):
         options["account_name"] = account
     if endpoint:
         options["endpoint"] = endpoint
-    return AzureStore(url.bucket, prefix=prefix, **options)
+    return AzureStore(url.bucket, **options)

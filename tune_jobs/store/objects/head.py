@@ -13,7 +13,7 @@ from collections.abc import Collection, Container, Iterable, Mapping
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from analysis.records import FORMAT_VERSION
-from policies.errors import CheckpointError
+from policies.errors import UPGRADE, CheckpointError
 from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.store import names
 from tune_jobs.store.objects.bucket import Bucket, Found, Tag
@@ -113,7 +113,7 @@ def _parsed(found: Found, name: str) -> Head:
     if head.format_version > FORMAT_VERSION:
         raise CheckpointError(
             f"{name} has format version {head.format_version}; this tune-jobs reads up to {FORMAT_VERSION}.",
-            "Upgrade tune-jobs: `pip install --upgrade tune-jobs`.",
+            UPGRADE,
         )
     if any(iteration < 0 or iteration >= 10**18 for iteration in head.checkpoints):
         raise CheckpointError(

@@ -39,6 +39,8 @@ from tune_jobs.store.places import is_trial_id
 
 _LOCK, _DRIVER_LOCK = "lock.json", "driver-lock.json"
 _CLAIM, _STOP = "claim", "stop"
+OF_A_NEW_SWEEP = frozenset({_CLAIM, _LOCK, RECORDS})
+"""What there is of a sweep before its record."""
 _UNCLAIM_S = 2.0
 """How long it is waited for that a name is free again."""
 

@@ -130,8 +130,8 @@ class ObjectTrial:
     def keep_iterations(self, records: Sequence[IterationRecord]) -> None:
         """Replace all results by those up to the checkpoint that the trial continues from."""
         self._state.begin()
-        self._state.local().keep_iterations(records)
-        self._state.changed(has_results=True)
+        with self._state.replacing_results():
+            self._state.local().keep_iterations(records)
 
     def read_results(self) -> ResultsFile:
         """Read the results."""
@@ -300,7 +300,7 @@ class ObjectTrial:
     # -- its curves, log and tally
 
     def append_events(self, name: str, data: bytes) -> None:
-        """Append to one of the trial's event files, which is uploaded whole from time to time."""
+        """Append to one of the trial's event files, or to one that follows it; see `Parts.append`."""
         self._parts.append(f"{self._folder}/{names.EVENTS_FOLDER}/{Path(name).name}", data)
 
     @property

@@ -28,6 +28,8 @@ _RecordT = TypeVar("_RecordT", bound=BaseModel)
 
 RECORDS = "records"
 _EVENTS_AFTER_S = 10.0
+_EVENTS_BYTES = 2**18
+"""A file that grows is uploaded whole each time: a larger one is left, and another one begun."""
 _REMOVED_AFTER_S = 3.0
 _ATTEMPTS = 20
 
@@ -66,6 +68,8 @@ class Parts:
         self._tags: dict[str, Tag | None] = {}
         self._pending: dict[str, bytes] = {}
         self._gone: set[str] = set()
+        self._num_left: dict[str, int] = {}
+        """How many large files are left, of those that grow."""
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -343,13 +347,20 @@ class Parts:
     # -- files that grow
 
     def append(self, key: str, data: bytes) -> None:
-        """Append to a file that only this process writes to; it is uploaded from time to time."""
-        path = self.own() / "appended" / key
+        """Append to a file that only this process writes to; it is uploaded from time to time.
+
+        What comes after a large one begins another file, `KEY.0002` and so on, which is sorted behind it.
+        """
+        num_left = self._num_left.get(key, 0)
+        present = f"{key}.{num_left + 1:04d}" if num_left else key
+        path = self.own() / "appended" / present
         with filling(), open_to_append(path) as file:
             file.write(data)
+            if file.tell() >= _EVENTS_BYTES:
+                self._num_left[key] = num_left + 1
         job = "appended", str(path)
         self.jobs.add(job)
-        outbox().add(job, lambda: self._upload_file(key, path), after_s=_EVENTS_AFTER_S)
+        outbox().add(job, lambda: self._upload_file(present, path), after_s=_EVENTS_AFTER_S)
 
     def _upload_file(self, key: str, path: Path) -> None:
         self.bucket.put(key, path.read_bytes())

@@ -103,15 +103,25 @@ def write_local(path: Path, data: bytes | str) -> None:
         write_atomic(path, data)
 
 
-def grow_local(path: Path, data: bytes) -> None:
+def grow_local(path: Path, data: bytes, offset: int = 0) -> None:
     """Write a file into one of these folders; one that begins like it stays the same file, for who has it open.
+
+    Args:
+        path: The file.
+        data: What it is to have from the offset on.
+        offset: How many bytes of the present file stay; they are not read.
 
     Raises:
         CannotRunError: It cannot be written.
     """
-    present = path.read_bytes() if path.exists() else None
-    if present is None or not data.startswith(present):
+    if not offset and not path.exists():
         write_local(path, data)
+        return
+    with path.open("rb") as file:
+        file.seek(offset)
+        present = file.read()
+    if not data.startswith(present):
+        write_local(path, path.read_bytes()[:offset] + data)
         return
     with filling(), path.open("ab") as file:
         file.write(data[len(present) :])

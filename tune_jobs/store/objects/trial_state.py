@@ -7,11 +7,12 @@ no head names any more is removed.
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from weakref import WeakMethod
 
@@ -26,8 +27,8 @@ from tune_jobs.store.objects.held import Held, held
 from tune_jobs.store.objects.outbox import outbox
 from tune_jobs.store.objects.owners import Epoch, lost
 from tune_jobs.store.objects.parts import Parts
-from tune_jobs.store.objects.result_chunks import ResultChunks
-from tune_jobs.store.objects.scratch import grow_local, make_local, write_local
+from tune_jobs.store.objects.result_chunks import NewChunk, ResultChunks
+from tune_jobs.store.objects.scratch import make_local, write_local
 from tune_jobs.store.trial_contract import Ownership
 from tune_jobs.store.trial_store import TrialStore
 
@@ -68,6 +69,7 @@ class TrialState:
         self._results: tuple[Chunk, ...] = ()
         self._has_results = False
         self._stored = CheckpointObjects(self._bucket, self._prefix)
+        self._chunks = ResultChunks(self._bucket, self._prefix)
         self.copies = CopyObjects(self._bucket, self._prefix, WeakMethod(self.folder))
         self._lock = threading.RLock()
         # What the head and the local results are as of, while much is read.
@@ -155,15 +157,15 @@ class TrialState:
 
     # -- what is read
 
-    @property
-    def _chunks(self) -> ResultChunks:
-        return ResultChunks(self._bucket, self._prefix, self.folder() / "chunks")
-
     def folder(self) -> Path:
         """Return the local folder of the trial, in one of this process."""
         if self._folder is None:
             self._folder = self._parts.own() / secrets.token_hex(4)
         return self._folder / names.TRIALS_FOLDER / self._trial_id
+
+    @property
+    def _results_path(self) -> Path:
+        return self.folder() / names.RESULTS
 
     def local(self) -> TrialStore:
         """Return the local files of the trial, with the results that there are now."""
@@ -239,14 +241,9 @@ class TrialState:
         return CheckpointError(message, "Restore the objects, or an earlier version of the head.")
 
     def _write_results(self, head: Head) -> bool:
-        path = self.folder() / names.RESULTS
-        if not head.has_results:
-            path.unlink(missing_ok=True)
-            return True
-        content = self._chunks.read(head.results)
-        if content is None:
-            return False
-        grow_local(path, content)
+        if head.has_results:
+            return self._chunks.read(head.results, self._results_path)
+        self._results_path.unlink(missing_ok=True)
         return True
 
     # -- what is written
@@ -264,6 +261,14 @@ class TrialState:
         self._has_results = self._has_results or has_results
         self._parts.jobs.add(self._job)
         outbox().add(self._job, self._upload, after_s=after_s)
+
+    @contextlib.contextmanager
+    def replacing_results(self) -> Iterator[None]:
+        """Replace the local results in the block, and have them uploaded after it."""
+        with self._lock:
+            self._chunks.forget_file()
+            yield
+        self.changed(has_results=True)
 
     def wrote_checkpoint(self, iteration: int) -> None:
         """Have a checkpoint uploaded that is in its local folder."""
@@ -299,18 +304,17 @@ class TrialState:
             name = free(names.RESULTS, self._damaged)
             self._damaged[name] = " ".join(chunk.key for chunk in self._results)
             self._results, self._has_results = (), False
-            (self.folder() / names.RESULTS).unlink(missing_ok=True)
+            self._results_path.unlink(missing_ok=True)
         self.changed(after_s=0.0)
         return name
 
     def _upload(self) -> None:
         self.check()
         with self._lock:
-            wanted = dict(self._checkpoints)
-            keys, damaged, has_results = dict(self._keys), dict(self._damaged), self._has_results
-            content = (self.folder() / names.RESULTS).read_bytes() if has_results else b""
-            known, noted = self._results, self.copies.noted
-        stored, results = self._upload_objects(wanted, keys, content, known)
+            wanted, keys, damaged = dict(self._checkpoints), dict(self._keys), dict(self._damaged)
+            has_results, noted = self._has_results, self.copies.noted
+            results, new = self._chunks.divide(self._results_path, self._results) if has_results else ((), None)
+        stored = self._upload_objects(wanted, keys, new)
         head = self._head.model_copy(
             update={
                 "owner": self._token if self._token is not None else self._head.owner,
@@ -332,26 +336,22 @@ class TrialState:
         self.copies.remove_replaced(noted, max(stored, default=0))
 
     def _upload_objects(
-        self,
-        wanted: Mapping[int, StoredCheckpoint | None],
-        keys: Mapping[int, str],
-        content: bytes,
-        known: Sequence[Chunk],
-    ) -> tuple[dict[int, StoredCheckpoint], tuple[Chunk, ...]]:
-        """Upload what the store lacks, side by side, and return all checkpoints and results for the head."""
-        results = list[Chunk]()
+        self, wanted: Mapping[int, StoredCheckpoint | None], keys: Mapping[int, str], last: NewChunk | None
+    ) -> dict[int, StoredCheckpoint]:
+        """Upload what the store lacks, side by side, and return all checkpoints for the head."""
         new = [iteration for iteration, stored in sorted(wanted.items()) if stored is None]
 
         def upload(iteration: int | None) -> StoredCheckpoint | None:
             if iteration is not None:
                 return self._upload_checkpoint(iteration, keys[iteration])
-            results.extend(self._chunks.upload(content, known))
+            if last is not None:
+                self._chunks.upload(last, self._results_path)
             return None
 
         # The first is done by this thread, so that the files of a single checkpoint are side by side, too.
         uploaded = dict(zip(new, side_by_side(upload, [*new, None]), strict=False))
         found = {iteration: stored or uploaded[iteration] for iteration, stored in sorted(wanted.items())}
-        return {iteration: stored for iteration, stored in found.items() if stored is not None}, tuple(results)
+        return {iteration: stored for iteration, stored in found.items() if stored is not None}
 
     def _commit(self, head: Head) -> None:
         try:
@@ -383,7 +383,7 @@ class TrialState:
     def _remove_unnamed(self, before: Head, now: Head) -> None:
         """Remove the objects that one head named, and no head names any more."""
         named = now.named()
-        gone = self._chunks.forget({chunk.key for chunk in before.results} - named)
+        gone = self._chunks.forget({chunk.key for chunk in before.results} - named, self._results_path)
         gone += self._stored.keys_of(before.checkpoints, named)
         # Nobody waits for it: what is not removed is a leftover.
         self._parts.remove_later(gone)
