@@ -29,8 +29,8 @@ install: $(VENV)/installed
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "tune-jobs needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=python3.11"; exit 5; }
-	@base=$$($(PYTHON) -c 'import os, sys; print(os.path.realpath(sys.executable))') && rm -f $(BIN)/python* && \
-		"$$base" -m venv $(VENV)
+	@base=$$($(PYTHON) -c 'import os, sys; print(os.path.realpath(sys._base_executable))') && \
+		{ test ! -d $(BIN) || find $(BIN) -name 'python*' -type l -exec rm {} +; } && "$$base" -m venv $(VENV)
 
 # One without pip was made by half, as where Debian's python3-venv is missing, or by uv; or its Python is gone, or another
 # by now. Make takes nothing in it as done then: its links to Python are made anew, of what $(PYTHON) comes from, as that

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.records import IterationRecord, Objective, TrialRecord, TrialState, whole_length
+from analysis.records import IterationRecord, Objective, TrialRecord, TrialState, longest_length, whole_length
 from analysis.statistics import area_under_curve, moderated_means
 from analysis.statistics.estimate import exponent_of
 
@@ -66,6 +66,7 @@ def rank_settings(
     num_iterations: int | None = None,
     threshold: float | None = None,
     worst: float | None = None,
+    longest: int | None = None,
 ) -> list[SettingScores]:
     """Return the settings of a sweep, the one with the best expected mean first.
 
@@ -83,10 +84,13 @@ def rank_settings(
         num_iterations: The iterations that it has at most, `stop.num_iterations`; None: any number.
         threshold: The return to reach, for `steps_to_threshold`.
         worst: What a failed trial counts as, where other sweeps are looked at too; None: what this one says.
+        longest: As for `score_of`, where other sweeps are looked at too; None: that of these trials.
 
     Raises:
         ValueError: `steps_to_threshold` without a threshold.
     """
+    if longest is None:
+        longest = longest_length(trials, num_env_steps=num_env_steps, num_iterations=num_iterations)
     shown: dict[str, float | None] = {}
     for trial in trials:
         if trial.status == "failed":
@@ -95,13 +99,13 @@ def rank_settings(
             items = results.get(trial.trial_id, ())
             shown[trial.trial_id] = score_of(
                 trial, items, objective, num_env_steps=num_env_steps, num_iterations=num_iterations,
-                threshold=threshold,
+                threshold=threshold, longest=longest,
             )  # fmt: skip
     known = {trial_id: score for trial_id, score in shown.items() if score is not None}
     if not known:
         return []
     if worst is None:
-        worst = failed_score(known.values(), objective, num_env_steps=num_env_steps)
+        worst = failed_score(known.values(), objective, num_env_steps=longest)
     members: defaultdict[int, list[TrialRecord]] = defaultdict(list)
     for trial in sorted(trials, key=lambda item: item.index):
         if trial.trial_id in shown:
@@ -138,7 +142,7 @@ def failed_score(scores: Iterable[float], objective: Objective, *, num_env_steps
     Args:
         scores: The scores that there are, one at least.
         objective: What they are of.
-        num_env_steps: The env steps that a training has.
+        num_env_steps: The env steps that the longest training has.
     """
     worst = min(scores)
     return min(worst, _never_reached(num_env_steps)) if objective == "steps_to_threshold" else worst
@@ -151,6 +155,10 @@ def _never_reached(num_env_steps: int) -> float:
 def reached_goal(trial: TrialState) -> bool:
     """Whether a trial ended because it reached the return that its sweep stops at."""
     return (trial.stop_reason or "").startswith(_GOALS)
+
+
+def _ended_itself(trial: TrialState) -> bool:
+    return trial.status == "completed" and trial.stop_reason is not None and not reached_goal(trial)
 
 
 def env_steps_of(trial: TrialRecord, num_env_steps: int, num_iterations: int | None = None) -> int:
@@ -179,6 +187,7 @@ def score_of(
     num_env_steps: int,
     num_iterations: int | None = None,
     threshold: float | None = None,
+    longest: int | None = None,
 ) -> float | None:
     """Return what a trial scored, see `trial_score`, over the env steps that it was to have.
 
@@ -193,14 +202,17 @@ def score_of(
         num_env_steps: The env steps that a trial has at most.
         num_iterations: The iterations that it has at most, `stop.num_iterations`; None: any number.
         threshold: The return to reach, for `steps_to_threshold`.
+        longest: The env steps of the sweep's longest training, see `longest_length`: by `steps_to_threshold` one that
+            never reaches it counts as twice these, however long it was to be itself; None: `num_env_steps`.
 
     Raises:
         ValueError: `steps_to_threshold` without a threshold.
     """
-    if objective != "steps_to_threshold":
-        num_env_steps = whole_length(
-            trial.point, trial.hyperparams, num_env_steps=num_env_steps, num_iterations=num_iterations
-        )
+    if objective == "steps_to_threshold":
+        num_env_steps = num_env_steps if longest is None else longest
+    else:
+        most = None if _ended_itself(trial) else num_iterations
+        num_env_steps = whole_length(trial.point, trial.hyperparams, num_env_steps=num_env_steps, num_iterations=most)
     return score_so_far(trial, iterations, objective, num_env_steps=num_env_steps, threshold=threshold)
 
 
@@ -218,15 +230,14 @@ def score_so_far(
         trial: Where it stands.
         iterations: Its iterations, oldest first.
         objective: What it is judged by.
-        num_env_steps: The env steps that it is to have itself; for `steps_to_threshold` those of the sweep.
+        num_env_steps: The env steps that it is to have itself; for `steps_to_threshold` those of the longest.
         threshold: The return to reach, for `steps_to_threshold`.
 
     Raises:
         ValueError: `steps_to_threshold` without a threshold.
     """
-    ended_itself = trial.status == "completed" and trial.stop_reason is not None and not reached_goal(trial)
     # What never reached the threshold counts as the same number of env steps, however long it tried.
-    if ended_itself and trial.num_env_steps and objective != "steps_to_threshold":
+    if _ended_itself(trial) and trial.num_env_steps and objective != "steps_to_threshold":
         num_env_steps = min(num_env_steps, trial.num_env_steps)
     return trial_score(iterations, objective, num_env_steps=num_env_steps, threshold=threshold)
 
@@ -248,13 +259,13 @@ def trial_score(
     - `area`: the mean evaluation return over all its env steps, `statistics.area_under_curve`.
     - `best`: its best evaluation.
     - `steps_to_threshold`: minus the env steps to the first evaluation that reaches the threshold, and minus twice
-      `num_env_steps` if none does, as in PAR2, the penalised run time of algorithm configuration (Hutter et al. 2009,
-      "ParamILS", section 2).
+      those of the longest training if none does, as in PAR2, the penalised run time of algorithm configuration (Hutter
+      et al. 2009, "ParamILS", section 2).
 
     Args:
         iterations: Its iterations, oldest first.
         objective: What it is judged by.
-        num_env_steps: The env steps that a trial has, `stop.num_env_steps`.
+        num_env_steps: The env steps that the trial is to have; for `steps_to_threshold` those of the longest.
         threshold: The return to reach, for `steps_to_threshold`.
 
     Raises:

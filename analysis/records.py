@@ -11,13 +11,14 @@ files have the strings "NaN", "Infinity" and "-Infinity" for them. Files of olde
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, computed_field, field_validator
 
 from analysis.notebook import Brief
 from analysis.waits import WaitRecord
+from policies.iteration_length import iteration_length
 
 FORMAT_VERSION = 3
 """The newest format of a sweep's files, which sweep.json has: 0.1.0 would write it again without what it lacked."""
@@ -70,10 +71,24 @@ def whole_length(
         num_env_steps: The env steps that a trial of the sweep has at most.
         num_iterations: The iterations that it has at most; None: any number.
     """
-    length = length_of(point, num_env_steps)
-    iteration = hyperparams.get("env_steps_per_iteration", hyperparams.get("train_batch_size"))
-    # A record of another version may say nothing of it.
-    return length if num_iterations is None or type(iteration) is not int else min(length, num_iterations * iteration)
+    length, iteration = length_of(point, num_env_steps), iteration_length(hyperparams)
+    return length if num_iterations is None or iteration is None else min(length, num_iterations * iteration)
+
+
+def longest_length(trials: Iterable[TrialRecord], *, num_env_steps: int, num_iterations: int | None = None) -> int:
+    """Return the env steps that the longest of a sweep's trials is to have, see `whole_length`.
+
+    Args:
+        trials: Those of one sweep; a trial whose point is not chosen yet says nothing.
+        num_env_steps: The env steps that a trial of the sweep has at most.
+        num_iterations: The iterations that it has at most; None: any number.
+    """
+    lengths = (
+        whole_length(trial.point, trial.hyperparams, num_env_steps=num_env_steps, num_iterations=num_iterations)
+        for trial in trials
+        if trial.has_point
+    )
+    return max(lengths, default=num_env_steps)
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -107,8 +122,8 @@ class Record(BaseModel):
 class RewrittenRecord(Record):  # noqa: PLW1641 (frozen, so pydantic makes its hash)
     """A record whose file is written again while a sweep goes on, maybe by an older version than wrote it before.
 
-    What a newer version added stays in the file, and nothing else is done with it: records that differ in it alone are
-    equal.
+    What a newer version added at its top level stays in the file, and nothing else is done with it: records that differ
+    in it alone are equal.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -339,7 +354,12 @@ class SweepRecord(RewrittenRecord):
 
     @property
     def max_iterations(self) -> int | None:
-        """The iterations that a trial has at most, `stop.num_iterations`; None: the record doesn't say."""
+        """The iterations that a trial has at most, `stop.num_iterations`; None: the record doesn't say.
+
+        None, too, in a population: how long an iteration is may change there, as its trials' values do.
+        """
+        if self.is_population:
+            return None
         stated = self.section("stop").get("num_iterations")
         return stated if isinstance(stated, int) else None
 

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 from analysis import report_data, wording
 from analysis.best_records import BestRecord, SettingsRecord
-from analysis.compact import lean
 from analysis.iterations_csv import write_iterations
 from analysis.page import all_trials, answer, cards, charts, cost, front, head, how_sure, mattered, next_steps, repeat
 from analysis.page.bounded import bounded
@@ -79,7 +78,7 @@ def build_report(
     write_csv(target / "steps_to_solve.csv", steps_to_solve_frame(trials, results, threshold=goal))
     if settings is None and best is not None:
         settings = best.settings
-    results = bounded(lean(results))
+    results = bounded(results)
     source = Source(place, sweep, trials, results, best, goal, why_no_best, settings)
     page = _render(
         source=source,

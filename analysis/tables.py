@@ -341,8 +341,6 @@ def steps_to_solve_frame(
         points.setdefault(trial.point_index, []).append(trial)
     rows = []
     for index, members in sorted(points.items()):
-        # Seeds of one point have the same values; a population, whose trials change theirs, has one seed a point.
-        point = solving_point(members[0], threshold, results.get(members[0].trial_id, ()))
         steps = {
             trial.seed_index: _env_steps_to_solve(trial, threshold, results.get(trial.trial_id, ()))
             for trial in members
@@ -350,6 +348,8 @@ def steps_to_solve_frame(
         # A seed that still runs may yet solve it.
         known = [steps[t.seed_index] for t in members if t.status in FINISHED or steps[t.seed_index] is not None]
         solved = [value for value in known if value is not None]
+        # Seeds of one point have the same values; a population, whose trials change theirs, has one seed a point.
+        point = solving_point(members[0], threshold, results.get(members[0].trial_id, ()))
         rows.append(
             {
                 "point_index": index,

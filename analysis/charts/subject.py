@@ -12,7 +12,7 @@ from analysis.charts.model import Ending
 from analysis.importance import WhatMattered
 from analysis.objectives import SettingScores, rank_settings, score_of
 from analysis.points import value_text
-from analysis.records import Cost, IterationRecord, Objective, SweepRecord, TrialRecord
+from analysis.records import Cost, IterationRecord, Objective, SweepRecord, TrialRecord, longest_length
 from analysis.tables import point_names
 from analysis.wording import short_text
 
@@ -91,8 +91,12 @@ class Subject:
 
     @property
     def _num_iterations(self) -> int | None:
-        # How long an iteration is may change in a population, as its trials' values do.
+        # Trials may tell of changes that the sweep file does not.
         return None if self.is_population else self.sweep.max_iterations
+
+    @cached_property
+    def _longest(self) -> int:
+        return longest_length(self.trials, num_env_steps=self._num_env_steps, num_iterations=self._num_iterations)
 
     @property
     def score_name(self) -> str:
@@ -110,7 +114,7 @@ class Subject:
         items = self.results.get(trial.trial_id, ())
         score = score_of(
             trial, items, self.objective, num_env_steps=self._num_env_steps, num_iterations=self._num_iterations,
-            threshold=self._threshold,
+            threshold=self._threshold, longest=self._longest,
         )  # fmt: skip
         return score if score is not None and math.isfinite(score) else None
 
@@ -122,7 +126,7 @@ class Subject:
             trials = [trial.model_copy(update={"point_index": trial.index, "seed_index": 0}) for trial in trials]
         return rank_settings(
             trials, self.results, self.objective, num_env_steps=self._num_env_steps,
-            num_iterations=self._num_iterations, threshold=self._threshold,
+            num_iterations=self._num_iterations, threshold=self._threshold, longest=self._longest,
         )  # fmt: skip
 
     def ending(self, trial: TrialRecord) -> Ending:

@@ -64,10 +64,8 @@ def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Com
     failed = None if reasons else _failed_score(list(alone.values()))
     # Were it twice the length of each sweep, the shorter one would be the better for not reaching the threshold.
     by_longest = chosen == "steps_to_threshold" and not reasons
-    longest = max(item.data.num_env_steps for item in wanted) if by_longest else None
-    ready = {
-        letter: judged_alike(item, chosen, threshold, failed, num_env_steps=longest) for letter, item in named.items()
-    }
+    longest = max(item.data.longest for item in wanted) if by_longest else None
+    ready = {letter: judged_alike(item, chosen, threshold, failed, longest=longest) for letter, item in named.items()}
     entries = tuple(
         make_entry(item, letter, alone[letter].data, shares_threshold=shares_threshold)
         for letter, item in ready.items()
@@ -88,7 +86,7 @@ def _failed_score(wanted: Sequence[Wanted]) -> float | None:
     scores = [score for item in wanted for setting in ranked_settings(item.data) for score in setting.scores]
     if not scores:
         return None
-    longest = max(item.data.num_env_steps for item in wanted)
+    longest = max(item.data.longest for item in wanted)
     return failed_score(scores, wanted[0].data.objective, num_env_steps=longest)
 
 
@@ -165,7 +163,7 @@ def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[st
 
 def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry], longest: int | None) -> list[str]:
     notes = _same_trainings(wanted, entries)
-    budgets = {entry.letter: item.data.num_env_steps for item, entry in zip(wanted, entries, strict=True)}
+    budgets = {entry.letter: item.data.longest for item, entry in zip(wanted, entries, strict=True)}
     if len(set(budgets.values())) > 1:
         told = ", ".join(f"{letter} {steps:,}" for letter, steps in budgets.items())
         notes.append(f"Trials may take different numbers of env steps: {told}.")

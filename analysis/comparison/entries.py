@@ -88,7 +88,7 @@ def judged_alike(
     threshold: float | None,
     failed_score: float | None = None,
     *,
-    num_env_steps: int | None = None,
+    longest: int | None = None,
 ) -> Wanted:
     """Return what is compared, judged by this objective and solved at this return.
 
@@ -97,14 +97,14 @@ def judged_alike(
         objective: What it is judged by.
         threshold: The return that solves the env.
         failed_score: What a failed seed counts as; None: what its sweep by itself says.
-        num_env_steps: By `steps_to_threshold`, of what length a training is that never reaches it; None: its own.
+        longest: The env steps of the longest training of all that are compared; None: that of its sweep.
     """
     data = replace(
         wanted.data,
         objective=objective,
         threshold=threshold,
         failed_score=failed_score,
-        num_env_steps=wanted.data.num_env_steps if num_env_steps is None else num_env_steps,
+        longest_env_steps=longest,
     )
     return replace(wanted, data=data)
 
@@ -171,7 +171,7 @@ def _chosen(wanted: Wanted, ranking: Sequence[SettingScores], alone: SweepData) 
     index = wanted.point_index
     if index is None:
         # The setting that the sweep names by itself, whatever the others' worst is, and how long they are.
-        is_judged_anew = alone.num_env_steps != wanted.data.num_env_steps or any(item.num_unscored for item in ranking)
+        is_judged_anew = alone.longest != wanted.data.longest or any(item.num_unscored for item in ranking)
         own = ranked_settings(alone) if is_judged_anew else ranking
         index = own[0].point_index if own else None
     return next((item for item in ranking if item.point_index == index), None)

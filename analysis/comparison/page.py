@@ -71,7 +71,7 @@ def write_page(path: Path, comparison: Comparison, wanted: Mapping[str, Wanted])
             comparison.objective,
             entry.threshold,
             comparison.failed_score,
-            num_env_steps=comparison.longest_env_steps,
+            longest=comparison.longest_env_steps,
         )
         for entry in comparison.entries
     }

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from analysis.front import points_on_front
 from analysis.objectives import SettingScores, rank_settings, score_of
-from analysis.records import IterationRecord, Objective, TrialRecord
+from analysis.records import IterationRecord, Objective, TrialRecord, longest_length
 from analysis.statistics import (
     Estimate,
     iqm,
@@ -52,6 +53,15 @@ class SweepData:
     """False of a population, whose trials change their values while they train."""
     num_iterations: int | None = None
     """The iterations that a trial has at most, `stop.num_iterations`; None: any number."""
+    longest_env_steps: int | None = None
+    """The env steps of the longest training, where other sweeps are looked at too; None: of the longest of `trials`."""
+
+    @cached_property
+    def longest(self) -> int:
+        """The env steps of the longest training, see `objectives.score_of`."""
+        if self.longest_env_steps is not None:
+            return self.longest_env_steps
+        return longest_length(self.trials, num_env_steps=self.num_env_steps, num_iterations=self.num_iterations)
 
 
 def make_frame(data: SweepData, rows: Rows) -> pd.DataFrame:
@@ -83,6 +93,7 @@ def _objective_score(trial: TrialRecord, data: SweepData) -> float | None:
         num_env_steps=data.num_env_steps,
         num_iterations=data.num_iterations,
         threshold=data.threshold,
+        longest=data.longest,
     )
 
 
@@ -180,6 +191,7 @@ def ranked_settings(data: SweepData) -> list[SettingScores]:
     return rank_settings(
         data.trials, data.results, data.objective, num_env_steps=data.num_env_steps,
         num_iterations=data.num_iterations, threshold=data.threshold, worst=data.failed_score,
+        longest=data.longest,
     )  # fmt: skip
 
 

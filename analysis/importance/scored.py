@@ -15,7 +15,15 @@ from typing import Any
 
 from analysis.importance.cut_short import is_evaluated, notes_of_cut, rows_until, training_alone
 from analysis.objectives import failed_score, score_of
-from analysis.records import FINISHED, IterationRecord, Objective, SweepRecord, TrialRecord, finite_or_none
+from analysis.records import (
+    FINISHED,
+    IterationRecord,
+    Objective,
+    SweepRecord,
+    TrialRecord,
+    finite_or_none,
+    longest_length,
+)
 from analysis.wording import counted
 
 
@@ -52,7 +60,8 @@ def score_points(
     if why_none:
         return Scored(objective, (), (), 0, why_none)
     first_cut = min((trial.num_env_steps for trial in ended if trial.status == "stopped"), default=None)
-    whole = int(sweep.section("stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
+    most = int(sweep.section("stop").get("num_env_steps") or max(trial.num_env_steps for trial in ended))
+    whole = longest_length(ended, num_env_steps=most, num_iterations=sweep.max_iterations)
     shown = [trial for trial in ended if trial.status != "failed"]
     ever, num_unevaluated = (set[str](), 0) if first_cut is None else _evaluated(shown, results, first_cut)
     if num_unevaluated:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from analysis.compact import CompactResults
+from analysis.compact import CompactIterations
 from analysis.plot_style import MAX_DRAWN
 from analysis.records import IterationRecord
 
@@ -14,7 +14,7 @@ def bounded(results: Mapping[str, Sequence[IterationRecord]]) -> Mapping[str, Se
     """Return iterations whose returns are at most 1e100 in size, so that their sums are finite, too."""
     if all(_is_bounded(item) for items in results.values() for item in items):
         return results
-    return CompactResults((trial_id, map(_bounded, items)) for trial_id, items in results.items()).lean()
+    return {trial_id: CompactIterations(map(_bounded, items)) for trial_id, items in results.items()}
 
 
 def _is_bounded(item: IterationRecord) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import tempfile
 from typing import IO
 
@@ -29,7 +30,10 @@ def shared_files() -> tuple[IO[bytes], IO[bytes]]:
     except OSError as error:
         # Unknown where no folder can be written: the error then names those that were tried.
         where = f" in {tempfile.tempdir}" if tempfile.tempdir else ""
+        many = error.errno in (errno.EMFILE, errno.ENFILE)
         raise CannotRunError(
             f"Environments are run with temporary files, and none can be written{where}: {error.strerror}.",
-            "Free space there, or set TMPDIR to another folder that can be written.",
+            "Raise the limit of open files (`ulimit -n`), or close some."
+            if many
+            else "Free space there, or set TMPDIR to another folder that can be written.",
         ) from error

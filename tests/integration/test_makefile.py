@@ -43,6 +43,6 @@ def test_a_broken_virtual_environment_is_mended_and_a_sound_one_left_alone(tmp_p
     assert "install --editable ." in made(tmp_path)
 
     subprocess.run([venv / "bin" / "python", "-m", "pip", "--version"], check=True, capture_output=True)
-    assert "install" not in made(tmp_path).replace("'install'", "")
+    assert "install --editable" not in made(tmp_path)
     # Nothing of whoever made it was deleted.
     assert len([*venv.glob("lib/python*/site-packages/own")]) == 1

@@ -148,6 +148,21 @@ def test_all_is_alike_where_no_episode_differs_in_training_or_evaluation(
     assert are_all_alike(results) == alike
 
 
+@pytest.mark.parametrize(
+    ("results", "alike"),
+    [
+        # The first iterations of a training are mostly not evaluated.
+        ([line(None, -200.0), line(-200.0, -200.0)], True),
+        ([line(None), line(-200.0), line(None, -200.0)], True),
+        ([line(None, -200.0), line(-200.0, -199.0)], False),
+        ([line(None), line(None)], False),
+    ],
+)
+def test_all_is_alike_as_well_where_iterations_come_one_by_one(results: list[IterationRecord], alike: bool) -> None:
+    """As of a sweep of millions, which are looked at once and not kept."""
+    assert are_all_alike(iter(results)) == alike
+
+
 def test_no_setting_is_trained_again_where_none_leads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     confirm: dict[str, Any] = {"top": 2, "seeds": 2, "max_share": 2.0}
     store = make_sweep_folder(tmp_path / "mine", confirm=confirm)

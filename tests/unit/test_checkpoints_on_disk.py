@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -12,6 +13,7 @@ from fake_engine import FakeEngine
 from store_parts import fill, make_checkpoint, make_iteration
 from trial_runs import Trial
 
+from policies.errors import CannotRunError
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
 
@@ -83,6 +85,20 @@ def test_the_results_are_on_disk_before_anybody_hears_that_a_trial_has_ended(
     size = trial.store.results_path.stat().st_size
     assert [number for name, number in synced if name == "results.jsonl"][-1] == size
     assert len(trial.results) == 3
+
+
+def test_a_disk_that_tells_late_that_it_is_full_is_told_with_the_file(
+    trial: TrialStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trial.append_iterations([make_iteration(1)])
+
+    def full(_: int) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(CannotRunError, match=r"results\.jsonl cannot be written: Disk quota exceeded") as raised:
+        trial.settle()
+    assert raised.value.hint == "Free space on its disk."
 
 
 def test_a_trial_without_results_has_none_to_sync(trial: TrialStore, synced: list[tuple[str, int]]) -> None:

@@ -134,7 +134,7 @@ def test_a_sweep_that_was_killed_between_its_trials_and_more_seeds_for_its_leade
     assert "lacks_seeds" not in run("status", store.folder, "--json").stdout + repr(verbs.status(store.folder))
     shown = run("attach", store.folder)
     assert shown.exit_code == 0
-    left_out = "the 4 leading settings got no more seeds (confirm), as nothing followed the trials"
+    left_out = "its leading settings got no more seeds (confirm), as nothing followed the trials"
     # A terminal's width breaks lines.
     words = " ".join(shown.stdout.split())
     assert f"no best policy: none was chosen, and {left_out}: `{command}` does both" in words
@@ -143,6 +143,15 @@ def test_a_sweep_that_was_killed_between_its_trials_and_more_seeds_for_its_leade
         assert told not in run("status", store.folder).stdout
     change(store, replications=(ReplicationRecord(num_points=4, points=(3, 2), by="confirm"),))
     assert told not in run("status", store.folder).stdout
+
+
+def test_to_tell_so_no_environment_is_made(run: RunCommand, tmp_path: Path) -> None:
+    """One of a module of one's own can't be, where nobody allowed it to be imported."""
+    store = make_sweep_folder(tmp_path / "raced", num_samples=4, seeds_per_point=1, confirm={"max_share": 2.0})
+    objective = {"type": "steps_to_threshold"}
+    change(store, spec={**store.read_record().spec, "env": {"id": "own_envs:Mine-v0"}, "objective": objective})
+    words = " ".join(run("attach", store.folder).stdout.split())
+    assert "its leading settings got no more seeds (confirm), as nothing followed the trials" in words
 
 
 @pytest.mark.parametrize("spec", [{}, {"num_samples": 1, "seeds_per_point": 4, "confirm": {"max_share": 2.0}}])

@@ -113,6 +113,22 @@ def test_a_removal_that_is_killed_half_way_leaves_the_name_free(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_sweep_that_cannot_be_removed_as_what_is_left_of_another_is_in_the_way_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = SweepStore(tmp_path / "mine")
+    store.create()
+    store.write_record(make_sweep())
+    left = tmp_path / ".mine.deleted"
+    (left / "trials").mkdir(parents=True)
+    # Somebody else's, which this user may not remove.
+    monkeypatch.setattr(shutil, "rmtree", lambda *_, **__: None)
+    with pytest.raises(CannotRunError, match="mine cannot be removed") as raised:
+        store.delete()
+    assert raised.value.hint == f"Remove what is left of it: {left}."
+    assert store.read_record() == make_sweep()
+
+
 # -- in an object store
 
 

@@ -1,5 +1,6 @@
 """Where `stop.num_iterations` ends trainings, what one scores and costs that ended before is of that length."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +11,25 @@ from synthetic_sweep import Synthetic, make_sweep
 from test_prior import begun, write_earlier
 
 from analysis.charts import Subject
+from analysis.comparison.compare import compare
+from analysis.comparison.entries import Wanted
 from analysis.exports.frames import SweepData, make_frame, ranked_settings
 from analysis.importance.scored import score_points
 from analysis.objectives import SettingScores, env_steps_of, score_of
 from analysis.page.cost import section as cost_section
 from analysis.page.next_steps import section as steps_section
-from analysis.records import TRAINING_LENGTH, IterationRecord, TrialRecord, TrialStatus, whole_length
+from analysis.records import TRAINING_LENGTH, IterationRecord, Objective, TrialRecord, TrialStatus, whole_length
 from policies.hyperparams import Algorithm, make_hyperparams
 from tests.narrowing import present
-from tune_jobs.plan.estimates import planned_env_steps
-from tune_jobs.search.history import known_points
+from tune_jobs.plan.estimates import iteration_env_steps, planned_env_steps
+from tune_jobs.search.history import KnownPoint, known_points
+from tune_jobs.search.prior import _mean_cost
 from tune_jobs.search.study import make_study
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.spec.training_length import as_trained
 from tune_jobs.sweeps.gathered import sweep_data
+from tune_jobs.sweeps.policy_choice import most_env_steps
 from tune_jobs.sweeps.settings import judged, ranked
 from tune_jobs.training.scoring import Judging, judging_of
 
@@ -161,7 +166,100 @@ def test_one_that_begins_with_it_too(tmp_path: Path) -> None:
 
 def test_steps_to_a_threshold_count_one_number_where_it_is_never_reached() -> None:
     spec = spec_of(objective={"type": "steps_to_threshold", "threshold": 900.0})
-    assert {setting.scores for setting in ranked(spec, TRIALS, RESULTS, None)} == {(-400_000.0,)}
+    assert {setting.scores for setting in ranked(spec, TRIALS, RESULTS, None)} == {(-2.0 * WHOLE,)}
+
+
+def reaching(index: int, point: int, seed: int, at: int | None) -> tuple[TrialRecord, list[IterationRecord]]:
+    """A trial of all its iterations, and the one of them from which on it reaches the threshold."""
+    record = trial(index, "completed", MOST, point_index=point, seed_index=seed, point={"lr": 1e-3 * (point + 1)})
+    return record, rows(*(float(at is not None and number >= at) for number in range(1, MOST + 1)))
+
+
+def test_never_to_reach_a_threshold_counts_as_twice_the_longest_training() -> None:
+    """One seed of five that doesn't was as bad as forty trainings, where only the iterations end them."""
+    made = [reaching(seed, 0, seed, at) for seed, at in enumerate((3, 3, 3, 3, None))]
+    made += [reaching(5 + seed, 1, seed, 19) for seed in range(5)]
+    trials, results = [record for record, _ in made], {record.trial_id: items for record, items in made}
+    objective = {"type": "steps_to_threshold", "threshold": 1.0}
+    best, other = ranked(spec_of(objective=objective), trials, results, None)
+    assert (best.point_index, other.point_index) == (0, 1)
+    assert min(best.scores) == -2.0 * WHOLE
+    gathered = SweepData(trials, results, "steps_to_threshold", 200_000, threshold=1.0, num_iterations=MOST)
+    assert make_frame(gathered, "trials")["objective_score"].min() == -2.0 * WHOLE
+    assert order(ranked_settings(gathered)) == [0, 1]
+    # It is one number, of the longest: whose iterations are shorter does not fail more cheaply, nor does a crash.
+    shorter = trials[4].model_copy(update={"hyperparams": {"train_batch_size": 256, "minibatch_size": 64}})
+    crashed = trials[9].model_copy(update={"status": "failed"})
+    scores = [
+        item.scores for item in ranked(spec_of(objective=objective), [shorter, crashed, trials[0]], results, None)
+    ]
+    assert sorted(scores) == [(-2.0 * WHOLE,), tuple(sorted((-3.0 * BATCH, -2.0 * WHOLE), reverse=True))]
+
+
+def test_a_search_is_told_twice_the_longest_training_that_it_may_choose() -> None:
+    space = {"train_batch_size": {"choice": [256, 600]}, "num_envs": {"choice": [8, 512]}}
+    objective = {"type": "steps_to_threshold", "threshold": 1.0}
+    spec = spec_of(objective=objective, space=space, search="gp", hyperparams={"minibatch_size": 64})
+    for values in ({"train_batch_size": 256, "num_envs": 8}, {"train_batch_size": 600, "num_envs": 512}):
+        told = present(judging_of(spec, make_sweep().sweep, values, {**values, "minibatch_size": 64}))
+        assert told.num_env_steps == 1_024 * MOST
+
+
+def test_sweeps_that_are_compared_share_the_longest_training() -> None:
+    record, items = reaching(0, 0, 0, None)
+    one = SweepData([record], {"t0000": items}, "steps_to_threshold", 200_000, threshold=1.0, num_iterations=MOST)
+    other = replace(one, num_iterations=2 * MOST)
+    wanted = [Wanted(name, make_sweep().sweep, data, 1.0) for name, data in (("mine", one), ("other", other))]
+    comparison = compare(wanted)
+    assert comparison.longest_env_steps == 2 * WHOLE
+    assert [entry.mean for entry in comparison.entries] == [-4.0 * WHOLE] * 2
+    notes = " ".join(comparison.notes)
+    assert f"Trials may take different numbers of env steps: A {WHOLE:,}, B {2 * WHOLE:,}." in notes
+    assert f"counts as {4 * WHOLE:,} env steps, twice the longest" in notes
+
+
+# -- iterations end with whole steps of all sub-environments, and with a phase of them
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "values", "length"),
+    [
+        ("ppo", {"train_batch_size": 256, "minibatch_size": 64, "num_envs": 512}, 512),
+        ("ppo", {"train_batch_size": 1_000, "num_envs": 512}, 1_024),
+        ("ppo", {"train_batch_size": 1_024, "num_envs": 512}, 1_024),
+        ("dqn", {"env_steps_per_iteration": 1_000, "train_freq": 48, "num_envs": 32}, 1_024),
+    ],
+)
+def test_an_iteration_is_of_whole_steps(algorithm: Algorithm, values: dict[str, Any], length: int) -> None:
+    made = make_hyperparams(algorithm, values)
+    assert iteration_env_steps(made) == length
+    ends: list[tuple[TrialStatus, int]] = [("completed", MOST), ("stopped", 10)]
+    whole, cut = (
+        trial(0, status, iterations, num_env_steps=length * iterations, hyperparams=made.model_dump(mode="json"))
+        for status, iterations in ends
+    )
+    assert [env_steps_of(each, 200_000, MOST) for each in (whole, cut)] == [length * MOST] * 2
+    spec = spec_of(algorithm=algorithm, space={}, scheduler={}, hyperparams=values)
+    assert planned_env_steps(spec, made) == length * MOST
+
+
+@pytest.mark.parametrize("objective", ["final", "area"])
+def test_who_ended_by_itself_is_judged_by_its_own_length(objective: Objective) -> None:
+    """With several env runners an iteration may be longer than its hyperparameters tell."""
+    longer = TRIALS[0].model_copy(update={"hyperparams": {"train_batch_size": BATCH // 2}})
+    expected = score_of(longer, RESULTS["t0000"], objective, num_env_steps=WHOLE)
+    assert score_of(longer, RESULTS["t0000"], objective, num_env_steps=200_000, num_iterations=MOST) == expected
+
+
+def test_what_an_earlier_sweep_tells_of_costs_is_of_the_same_length() -> None:
+    known = KnownPoint({"lr": 1e-3}, (1.0, 1.0), env_steps=(WHOLE, WHOLE + 8))
+    assert _mean_cost(known, spec_of(search="gp")) == WHOLE
+
+
+def test_choosing_the_best_policy_may_take_a_share_of_what_was_trained() -> None:
+    trials = [trial(index, "completed", MOST) for index in range(MOST)]
+    by_steps = most_env_steps(spec_of(stop={"num_env_steps": WHOLE}), trials)
+    assert most_env_steps(spec_of(), trials) == by_steps < most_env_steps(spec_of(stop={}), trials)
 
 
 # -- what else shows scores and costs
@@ -218,13 +316,27 @@ def test_what_mattered_is_of_the_same_scores() -> None:
     assert score_points(made.sweep, [REACHED], RESULTS, None).scores == (EXPECTED,)
 
 
+def test_what_mattered_counts_a_threshold_that_is_never_reached_as_twice_the_longest_training() -> None:
+    made = synthetic()
+    never = {"type": "steps_to_threshold", "threshold": 900.0}
+    sweep = made.sweep.model_copy(update={"spec": {**made.sweep.spec, "objective": never}})
+    trials = [TRIALS[0], trial(1, "completed", MOST)]
+    reached = rows(*(1_000.0 for _ in range(MOST)))
+    scores = score_points(sweep, trials, {**RESULTS, "t0001": reached}, None).scores
+    assert scores == (-2.0 * WHOLE, -1.0 * BATCH)
+
+
 def test_in_a_population_the_length_of_an_iteration_may_change() -> None:
     made = synthetic()
     spec = {**made.sweep.spec, "scheduler": {"type": "pbt"}, "objective": "final"}
     now = TRIALS[0].model_copy(update={"hyperparams": {"train_batch_size": 256}})
     source = source_of(made)
-    subject = Subject(made.sweep.model_copy(update={"spec": spec}), [now], RESULTS, None, source.importance)
+    changed = made.sweep.model_copy(update={"spec": spec})
+    subject = Subject(changed, [now], RESULTS, None, source.importance)
     assert subject.scores["t0000"] == score_of(TRIALS[0], RESULTS["t0000"], "final", num_env_steps=WHOLE)
+    stopped = TRIALS[1].model_copy(update={"hyperparams": {"train_batch_size": 256}})
+    facts = dict(cost_section(replace(source, sweep=changed, trials=[stopped])).facts)
+    assert facts["early stopping"].startswith("the scheduler ended 1 trial before 200,000 env steps, which saved 95 %")
 
 
 def test_what_a_training_takes_is_no_more_than_its_iterations() -> None:

@@ -16,6 +16,7 @@ from sweep_folders import MACHINE, SPEC, make_sweep_folder
 
 import tune_jobs
 from analysis.comparison.repetition import Changed, first_difference, same_numbers
+from analysis.records import FORMAT_VERSION
 from policies.acting.evaluate import evaluate_policy
 from policies.envs.make import check_env
 from policies.errors import CheckpointError, SpecError
@@ -233,13 +234,23 @@ def test_what_one_version_lacks_of_the_learners_numbers_is_no_difference() -> No
 # -- who goes on with a sweep is told
 
 
-@pytest.mark.parametrize("began", ["0.0.9", None, "mine"])
+@pytest.mark.parametrize(
+    ("began", "format_version", "words"),
+    [
+        ("0.0.9", FORMAT_VERSION, "tune-jobs 0.0.9"),
+        (None, FORMAT_VERSION, None),
+        ("mine", FORMAT_VERSION, None),
+        # That of a release, before the number was raised.
+        ("mine", 2, f"an earlier tune-jobs ({versions()['tune-jobs']})"),
+        (None, 2, "an earlier tune-jobs (no number)"),
+    ],
+)
 def test_a_sweep_that_another_version_began_is_told(
-    store: SweepStore, monkeypatch: pytest.MonkeyPatch, began: str | None
+    store: SweepStore, monkeypatch: pytest.MonkeyPatch, began: str | None, format_version: int, words: str | None
 ) -> None:
     here = versions()["tune-jobs"]
     found = {} if began is None else {"tune-jobs": here if began == "mine" else began}
-    store.write_record(store.read_record().model_copy(update={"versions": found}))
+    changes = {"versions": found, "format_version": format_version}
     unfinished(store)
     plans: list[SweepPlan] = []
 
@@ -256,9 +267,10 @@ def test_a_sweep_that_another_version_began_is_told(
         lambda: resume.replicate(store, None, lambda: None, finish=False, progress="none"),
     ]
     for go_on in calls:
+        store.write_record(store.read_record().model_copy(update=changes))
         with pytest.raises(SeenError):
             go_on()
     told = [[note for note in plan.notes if "was begun with" in note] for plan in plans]
-    assert [len(notes) for notes in told] == [int(began == "0.0.9")] * 2
-    assert all(f"begun with tune-jobs 0.0.9, and what is left of it trains as tune-jobs {here}" in note
+    assert [len(notes) for notes in told] == [int(words is not None)] * 2
+    assert all(f"begun with {words}, and what is left of it trains as tune-jobs {here}" in note
                for notes in told for note in notes)  # fmt: skip

@@ -8,6 +8,7 @@ from pack_plans import DQN, TPE, fake_reasons, plan
 from policies.guard import guarded
 from policies.packed.envs.make import StepTime
 from tests.narrowing import present
+from tune_jobs.plan import pack_plan
 from tune_jobs.plan.machine import Machine
 
 
@@ -118,6 +119,29 @@ def test_fewer_packs_where_their_processes_take_the_memory() -> None:
     (note,) = made.notes
     assert note.startswith("Packs are planned smaller: 64 x 1 trials at once may take 6.5 GB of memory with their ")
     assert note.endswith("processes, and what this machine has available is 4.0 GB. 39 x 1 trials run at once.")
+
+
+@pytest.mark.parametrize(("num_cpus", "gb", "expected"), [(32, 2, (15, 16)), (64, 4, (30, 16)), (64, 16, (64, 16))])
+def test_packs_are_fewer_rather_than_tiny_where_their_processes_take_the_memory(
+    num_cpus: int, gb: float, expected: tuple[int, int]
+) -> None:
+    members = [pack_plan.TrialToPack(f"t{index:04}", None, 2e6) for index in range(1024)]
+    num_packs, slots, notes = pack_plan._by_memory(Machine(num_cpus, memory_bytes=gb * 1e9), members, num_cpus, 16, 1)
+    assert (num_packs, slots) == expected
+    if num_packs == num_cpus:
+        assert notes == ()
+        return
+    # Their trials alone take about half.
+    assert "of memory with their processes, and what this machine has available is" in notes[0]
+    assert notes[0].endswith(f"{num_packs} x 16 trials run at once.")
+
+
+def test_no_pack_is_given_up_for_a_trial_more() -> None:
+    members = [pack_plan.TrialToPack(f"t{index:04}", None, 48e6) for index in range(128)]
+    # One pack could train 63.
+    (num_packs, slots, (note,)) = pack_plan._by_memory(Machine(2, memory_bytes=63.5 * 96e6), members, 2, 64, 1)
+    assert (num_packs, slots) == (2, 31)
+    assert "and half of what this machine has available is 3.0 GB" in note
 
 
 def test_a_trial_that_is_too_large_alone_has_a_pack_of_its_own() -> None:

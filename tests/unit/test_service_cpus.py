@@ -9,10 +9,12 @@ from services import FAKE, client, service  # noqa: F401 (fixtures)
 from sweep_folders import make_sweep_folder
 
 from tune_jobs.plan.machine import Machine
+from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.service import driver
 from tune_jobs.service.database.opening import sqlite_url
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.service import Service
+from tune_jobs.spec.file import load_spec
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.sweeps import drive, verbs
 
@@ -159,6 +161,22 @@ def test_the_ray_that_is_kept_warm_counts_with_as_many(monkeypatch: pytest.Monke
     with drive.within_cpus(3.0):
         assert drive.machine_here().fitting(1.0, 0.0) == 3
     assert drive.machine_here().fitting(1.0, 0.0) == NUM_CPUS
+
+
+@pytest.mark.parametrize(("most", "at_once"), [(64.0, 14), (80.0, 14), (8.0, 8)])
+def test_the_ray_that_is_kept_warm_runs_no_more_than_its_memory_allows(
+    monkeypatch: pytest.MonkeyPatch, most: float, at_once: int
+) -> None:
+    """Also where a job has all CPUs: it is this machine, and not a cluster that nodes may join."""
+    warm = Machine(64.0, nodes=((64.0, 0.0),), memory_bytes=8e9)
+    monkeypatch.setattr(drive, "_is_connected_by_user", lambda: True)
+    monkeypatch.setattr("tune_jobs.ray_tune.connected_ray.connected_machine", lambda: warm)
+    fields: dict[str, Any] = {"env": "CartPole-v1", "algorithm": "ppo", "engine": "rllib", "num_samples": 64}
+    spec = load_spec(fields | {"space": {"lr": {"uniform": [1e-4, 1e-3]}}, "confirm": "none"})
+    with drive.within_cpus(most):
+        assert make_plan(spec, drive.machine_here()).max_concurrent == at_once
+    # A Ray that a user has joined may be a cluster.
+    assert drive.machine_here() == warm
 
 
 def test_the_driver_is_told_the_cpus_of_its_job(service: Service, store: SweepStore) -> None:

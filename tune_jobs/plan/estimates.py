@@ -13,6 +13,7 @@ from policies.envs.masks import seen_by_networks
 from policies.envs.own_actions import sizes_of
 from policies.envs.spaces import observation_dtype
 from policies.hyperparams import DQNHyperparams, Hyperparams, PPOHyperparams, RandomHyperparams
+from policies.iteration_length import iteration_length
 from policies.portable.convolution import output_shape
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def max_iterations(spec: SweepSpec, values: Hyperparams) -> int:
 
 def _most_of_an_iteration(values: Hyperparams, num_runners: int) -> int:
     """Return the most env steps of one iteration; all sub-environments step together, so the last step overshoots."""
-    wanted = iteration_env_steps(values)
+    wanted = asked_env_steps(values)
     if isinstance(values, DQNHyperparams):
         # An iteration ends with a sampling phase, in which each env runner makes its share of train_freq.
         return wanted - 1 + num_runners * (math.ceil(values.train_freq / num_runners) - 1 + values.num_envs)
@@ -65,7 +66,12 @@ def _most_of_an_iteration(values: Hyperparams, num_runners: int) -> int:
 
 
 def iteration_env_steps(values: Hyperparams) -> int:
-    """Return the env steps that an iteration has at least."""
+    """Return the env steps that an iteration has at least, in whole steps of all of its sub-environments."""
+    return iteration_length(vars(values)) or asked_env_steps(values)
+
+
+def asked_env_steps(values: Hyperparams) -> int:
+    """Return the env steps that an iteration is to have, which its whole steps may go beyond."""
     return values.train_batch_size if isinstance(values, PPOHyperparams) else values.env_steps_per_iteration
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import heapq
 import itertools
 import math
@@ -102,24 +103,30 @@ def _by_memory(
     machine: Machine, members: Sequence[TrialToPack], num_packs: int, slots: int, cpus: float
 ) -> tuple[int, int, tuple[str, ...]]:
     """Return how many of the packs and slots memory allows, and a note if they are fewer."""
-    largest = heapq.nlargest(slots, (member.num_bytes for member in members))
-    wanted = num_packs, slots
-    # Whichever trials meet in a pack, they need at most as much memory as the largest ones.
-    while (budget := _budget(machine, num_packs, cpus)) is not None and num_packs > 1 and largest[0] > budget:
-        num_packs -= 1
-    if budget is None:
+    if machine.memory_per_process(num_packs, cpus) is None:
         return num_packs, slots, ()
-    slots = max(1, sum(total <= budget for total in itertools.accumulate(largest)))
-    if largest[0] > budget:
+    # Whichever trials meet in a pack, they need at most as much memory as the largest ones.
+    totals = list(itertools.accumulate(heapq.nlargest(slots, (member.num_bytes for member in members))))
+    wanted, fitting = (num_packs, slots), dict[int, int]()
+    for number in range(num_packs, 0, -1):
+        budget, are_processes = _budget(machine, number, cpus)
+        fitting[number] = bisect.bisect_right(totals, budget)
+        # Fewer packs than these would leave no more for trials, and CPUs idle.
+        if fitting[number] and not are_processes:
+            break
+    # The first, of most packs, if as many trials run at once with fewer.
+    num_packs = max(fitting, key=lambda number: number * fitting[number])
+    slots = fitting[num_packs]
+    if not slots:
         note = (
-            f"Packs are planned smaller: one trial may take {bytes_text(largest[0])} of memory, more than half of what "
+            f"Packs are planned smaller: one trial may take {bytes_text(totals[0])} of memory, more than half of what "
             f"{machine.has_available}, {bytes_text(budget)}. One pack trains one trial at a time."
         )
         return 1, 1, (note,)
     if (num_packs, slots) == wanted:
         return num_packs, slots, ()
-    needed, available = wanted[0] * sum(largest), machine.memory_bytes or 0.0
-    if needed <= available * SHARE_OF_MEMORY:
+    needed, available = wanted[0] * totals[-1], machine.memory_bytes or 0.0
+    if _budget(machine, wanted[0], cpus)[1]:
         why = f"{bytes_text(needed + wanted[0] * _PROCESS_BYTES)} of memory with their processes, and what "
         why += f"{machine.has_available} is {bytes_text(available)}"
     else:
@@ -129,13 +136,13 @@ def _by_memory(
     return num_packs, slots, (f"{note}{num_packs} x {slots} trials run at once.",)
 
 
-def _budget(machine: Machine, num_packs: int, cpus: float) -> float | None:
-    """Return the memory that the trials of each pack may take; None: it is not known."""
-    share = machine.memory_per_process(num_packs, cpus)
-    if share is None or num_packs == 1 or machine.nodes:
-        # One runs in any case; on a cluster only what trials keep is counted.
-        return None if share is None else share * SHARE_OF_MEMORY
-    return min(share * SHARE_OF_MEMORY, share - _PROCESS_BYTES)
+def _budget(machine: Machine, num_packs: int, cpus: float) -> tuple[float, bool]:
+    """Return the memory that the trials of each pack may take, and whether the packs' processes are what limits it."""
+    share = machine.memory_per_process(num_packs, cpus) or 0.0
+    half, beside = share * SHARE_OF_MEMORY, share - _PROCESS_BYTES
+    # One runs in any case; on a cluster only what trials keep is counted.
+    are_processes = num_packs > 1 and not machine.nodes and beside < half
+    return (beside if are_processes else half), are_processes
 
 
 def _spare_cpus(machine: Machine, num_packs: int, cpus: float, gpus: float, most: int) -> tuple[int, str]:

@@ -13,7 +13,7 @@ from analysis.wording import counted
 from policies.errors import SpecError
 from policies.hyperparams import Hyperparams, PPOHyperparams, RandomHyperparams, make_hyperparams
 from policies.wrong_values import details_of, dotted, explain
-from tune_jobs.plan.estimates import iteration_env_steps
+from tune_jobs.plan.estimates import asked_env_steps
 from tune_jobs.spec.draws import draw_points, num_different, num_points
 from tune_jobs.spec.seeds import SEEDS_PER_TRIAL
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -118,7 +118,7 @@ def _check_length(spec: SweepSpec, point: Mapping[str, Any], values: Hyperparams
     if TRAINING_LENGTH not in point:
         return
     length = int(point[TRAINING_LENGTH])
-    least, longest = iteration_env_steps(values), spec.stop.num_env_steps
+    least, longest = asked_env_steps(values), spec.stop.num_env_steps
     if length < least:
         name = "train_batch_size" if isinstance(values, PPOHyperparams) else "env_steps_per_iteration"
         raise SpecError(

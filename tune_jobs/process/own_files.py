@@ -42,7 +42,10 @@ def _files() -> Iterator[Path]:
 
 
 def _changed_at(file: Path) -> float:
-    """Return when a file was put there or changed last: its time of modification may be that of a package's build."""
+    """Return when a file was put there or changed last: its time of modification may be that of a package's build.
+
+    Another hard link changes it, too, as where uv makes a second environment.
+    """
     try:
         return file.lstat().st_ctime
     except FileNotFoundError:  # replaced at this moment

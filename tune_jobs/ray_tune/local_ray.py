@@ -30,7 +30,7 @@ from tune_jobs.ray_tune.replaced import replaced
 
 # Weights travel inside checkpoints and results are small: RLlib needs little of Ray's object store.
 _OBJECT_STORE_BYTES = 256 * 1024**2
-# Where less is left, Ray itself refuses to start, and says so.
+# Ray refuses to start with less; where no more is left, it measures by itself.
 _LEAST_BYTES = 100e6
 _PATH_TOO_LONG = "AF_UNIX path length"
 # Ray 2.60's processes ask a second later where a socket is not there yet, which the raylet's own may not be.

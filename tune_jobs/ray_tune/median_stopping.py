@@ -14,9 +14,9 @@ from typing_extensions import override
 class MedianStopping(MedianStoppingRule):  # type: ignore[misc]
     """Ray's rule, with equal decisions: the means that it compares are the same floats, and each is found once.
 
-    At each evaluation Ray's goes through all those of every trial that has come as far. Two private members of it are
-    used (2.60): `_results`, what was reported of each trial, to which it only appends, and `_running_mean`. A Ray
-    without them is as slow as its own.
+    At each evaluation Ray's goes through all those of every trial that has come as far. Private members of it
+    are used (2.60): `_results`, what was reported of each trial, to which it only appends, `_running_mean`, and its
+    settings `_grace_period`, `_time_attr` and `_metric`.
     """
 
     def __init__(self, **settings: Any) -> None:

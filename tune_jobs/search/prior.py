@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, TrialRecord, length_of
+from analysis.records import TRAINING_LENGTH, PriorPointRecord, PriorRecord, TrialRecord, whole_length
 from analysis.wording import counted, is_number
 from policies.errors import SpecError, shortened
+from policies.hyperparams import make_hyperparams
 from tune_jobs.search.chosen_point import as_written, outside
 from tune_jobs.search.history import TOLD, History, KnownPoint, tell_scores
 from tune_jobs.search.two_objectives import weighed
@@ -93,7 +94,9 @@ def _mean_cost(known: KnownPoint, earlier: SweepSpec) -> int | None:
     """
     if not known.env_steps:
         return None
-    length = length_of(known.point, earlier.stop.num_env_steps)
+    values = {**vars(make_hyperparams(earlier.algorithm, {})), **earlier.hyperparams, **known.point}
+    stop = earlier.stop
+    length = whole_length(known.point, values, num_env_steps=stop.num_env_steps, num_iterations=stop.num_iterations)
     return round(sum(min(steps, length) for steps in known.env_steps) / len(known.env_steps))
 
 

@@ -125,7 +125,7 @@ def _as_optunas(
     if trial.status != "failed":
         score = score_of(
             trial, iterations, data.objective, num_env_steps=data.num_env_steps, num_iterations=data.num_iterations,
-            threshold=data.threshold,
+            threshold=data.threshold, longest=data.longest,
         )  # fmt: skip
     told: dict[str, Any] = {"state": optuna.trial.TrialState.FAIL}
     if score is not None and math.isfinite(score):

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
-from analysis.compact import CompactResults
+from analysis.compact import CompactIterations
 from analysis.numbering import place_of
-from analysis.records import CheckpointRecord, IterationRecord, SweepRecord, TrialRecord
+from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS, SWEEP_RECORD
@@ -60,19 +60,17 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
     return sorted(records, key=lambda record: record.index)
 
 
-def read_results(store: Sweep) -> CompactResults:
+def read_results(store: Sweep) -> dict[str, CompactIterations]:
     """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
+    found = {}
     with store.reading():
-        return CompactResults(_read_results(store))
-
-
-def _read_results(store: Sweep) -> Iterator[tuple[str, Sequence[IterationRecord]]]:
-    for record in readable_trials(store):
-        try:
-            yield record.trial_id, store.trial(record.trial_id).read_iterations()
-        except CheckpointError as error:
-            leave_out(error)
-            yield record.trial_id, ()
+        for record in readable_trials(store):
+            try:
+                found[record.trial_id] = CompactIterations(store.trial(record.trial_id).read_iterations())
+            except CheckpointError as error:
+                leave_out(error)
+                found[record.trial_id] = CompactIterations([])
+    return found
 
 
 def candidates(trial: Trial) -> list[CheckpointRecord]:

@@ -147,8 +147,8 @@ class SweepStore:
         try:
             with self.lock():
                 remove_folder(hidden)
-                remove_file(self.record_path)
-                shutil.rmtree(self.folder.replace(hidden))
+                remove_file(self.folder.replace(hidden) / names.SWEEP_RECORD)
+                shutil.rmtree(hidden)
         except OSError as error:
             left = hidden if hidden.exists() else self.folder
             raise CannotRunError(

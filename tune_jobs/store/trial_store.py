@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 from analysis.records import CheckpointRecord, IterationRecord, TrialRecord
-from policies.errors import CheckpointError
+from policies.errors import CannotRunError, CheckpointError
 from policies.files import open_to_append, sync, write_atomic
 from tune_jobs.store import names
 from tune_jobs.store.logs import log_tail
@@ -100,7 +100,13 @@ class TrialStore(OwnedFolder):
     def settle(self) -> None:
         """Wait until the results are on disk, too: all else is there when it has been written."""
         if is_there(self.results_path):
-            sync(self.results_path)
+            try:
+                sync(self.results_path)
+            except OSError as error:
+                # NFS and quotas tell of a full disk as late as here.
+                raise CannotRunError(
+                    f"{self.results_path} cannot be written: {error.strerror}.", "Free space on its disk."
+                ) from error
 
     def write_record(self, record: TrialRecord, *, soon: bool = False) -> None:  # noqa: ARG002 (never later here)
         """Replace trial.json."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from analysis.records import SweepRecord, TrialRecord
@@ -17,7 +17,6 @@ from tune_jobs.store.candidates import readable_trials
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import resume_command
-from tune_jobs.sweeps.confirm import what_is_left_out
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.detached import failure_of, job_now, ran, why_not_asked
 from tune_jobs.sweeps.forecast import caps_of
@@ -26,6 +25,7 @@ from tune_jobs.sweeps.monitor import SweepMonitor
 from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
 from tune_jobs.sweeps.own_job import job_of
 from tune_jobs.sweeps.reached import reached_of
+from tune_jobs.sweeps.status import lacks_seeds
 
 _POLL_S = 0.5
 _ASK_EVERY_S = 5.0
@@ -214,7 +214,7 @@ def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
         record,
         trials,
         best=best,
-        why_no_best=_why_no_best(store) if is_whole and best is None else None,
+        why_no_best=_why_no_best(store, record, trials) if is_whole and best is None else None,
         artifacts=artifacts,
         interrupted=not is_whole,
         notes=notes_on_best(record, best),
@@ -223,12 +223,13 @@ def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:
     )
 
 
-def _why_no_best(store: Sweep) -> str:
+def _why_no_best(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> str:
     """Return why a sweep whose trials are done has no best policy, and what gives it one."""
     what = "the one there is was chosen before the sweep was trained on"
     if not store.has_best():
         what = "none was chosen"
         # Killed between the trials and what follows them: a choice now would be by one seed of each setting.
-        if (left_out := what_is_left_out(store)) is not None:
-            return f"{what}, and {left_out.removesuffix('.')}"
+        if lacks_seeds(store, record, trials):
+            why = "its leading settings got no more seeds (confirm), as nothing followed the trials"
+            return f"{what}, and {why}: `{resume_command(store, record)}` does both"
     return f"{what}. `tune-jobs best {name_in_commands(store.place)}` does it, or says why not"

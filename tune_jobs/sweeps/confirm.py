@@ -45,7 +45,7 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
         return ()
     threshold = threshold_for(spec)
     with store.reading():
-        trials, results = read_trials(store), read_results(store).lean()
+        trials, results = read_trials(store), read_results(store)
 
     def ranked_of(known: Sequence[TrialRecord]) -> list[SettingScores]:
         return ranked(spec, known, results, threshold)

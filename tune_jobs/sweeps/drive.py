@@ -132,7 +132,8 @@ def machine_here() -> Machine:
 
         machine = connected_machine()
     most = _most_cpus.get()
-    return machine if most is None or machine.num_cpus <= most else replace(machine, num_cpus=most, nodes=())
+    # Only a service limits them, whose Ray, kept warm, is this machine and no cluster: its memory limits trials too.
+    return machine if most is None else replace(machine, num_cpus=min(most, machine.num_cpus), nodes=())
 
 
 def cpus_for_episodes(address: str | None) -> int:

@@ -29,15 +29,15 @@ def sweep_data(store: Sweep) -> SweepData:
     except NotFoundError:
         # No winner was chosen yet, or it can't be read: then the env's own threshold counts.
         best = None
-    spec = spec_of(store)
+    spec, record = spec_of(store), store.read_record()
     return SweepData(
         trials=trials_as_left(store),
         results=read_results(store),
         objective=spec.objective.type,
         num_env_steps=spec.stop.num_env_steps,
-        threshold=goal_of(store.read_record(), best),
+        threshold=goal_of(record, best),
         has_settings=not spec.scheduler.is_population,
-        num_iterations=spec.stop.num_iterations,
+        num_iterations=record.max_iterations,
     )
 
 

@@ -36,6 +36,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import leave_out, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.transitions import with_checkpoints
+from tune_jobs.sweeps.forecast import caps_of
 
 MOST_CANDIDATES = 16
 """How many policies play at most."""
@@ -95,7 +96,7 @@ def choose_policy(
     if not known:
         raise no_usable_trial(trials)
     env_id, env_args, timeout_s = spec.env.id, spec.env.wrapped_args, spec.iteration_timeout_s
-    max_env_steps = most_env_steps(spec, len(trials))
+    max_env_steps = most_env_steps(spec, trials)
     cap = check_env(env_id, env_args, timeout_s=timeout_s).max_episode_steps or MAX_EPISODE_STEPS
     # One episode of each is played in any case.
     num_wanted = max(1, min(MOST_CANDIDATES, max_env_steps // cap))
@@ -169,9 +170,9 @@ def _records(rejects: Rejects, candidates: Sequence[Candidate]) -> list[Candidat
     return records
 
 
-def most_env_steps(spec: SweepSpec, num_trials: int) -> int:
+def most_env_steps(spec: SweepSpec, trials: Sequence[TrialRecord]) -> int:
     """Return how many env steps the rounds may take, by what the sweep may train."""
-    share = int(SHARE_OF_TRAINING * num_trials * spec.stop.num_env_steps)
+    share = int(SHARE_OF_TRAINING * sum(caps_of(spec, trials).values()))
     return max(MIN_ENV_STEPS, min(MAX_ENV_STEPS, share))
 
 
@@ -233,7 +234,7 @@ def confirmed_best(store: Sweep) -> BestRecord | None:
         read_policy(store.best_folder)
         store.trial(best.checkpoint.trial_id).verify_checkpoint(best.checkpoint.iteration)
         trials = read_trials(store)
-        budget = most_env_steps(stored_spec(store.read_record()), len(trials))
+        budget = most_env_steps(stored_spec(store.read_record()), trials)
     except TuneJobsError:
         return None
     same_budget = best.choice is None or best.choice.max_env_steps == budget

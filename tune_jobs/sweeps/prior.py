@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from analysis.objectives import score_of
-from analysis.records import PriorRecord, TrialRecord
+from analysis.records import PriorRecord, TrialRecord, longest_length
 from policies.errors import CheckpointError, NotFoundError, SpecError, shortened
 from tune_jobs.search.history import TOLD
 from tune_jobs.search.prior import prior_record
@@ -69,6 +69,8 @@ def _judged(store: Sweep, earlier: SweepSpec, env_threshold: float | None) -> li
     can_be_judged = objective in TOLD and (objective == "area" or threshold is not None)
     if not can_be_judged or not any(map(_lacks_score, trials)):
         return trials
+    num_env_steps, num_iterations = earlier.stop.num_env_steps, earlier.stop.num_iterations
+    longest = longest_length(trials, num_env_steps=num_env_steps, num_iterations=num_iterations)
     judged = []
     with store.reading():
         for trial in trials:
@@ -80,8 +82,8 @@ def _judged(store: Sweep, earlier: SweepSpec, env_threshold: float | None) -> li
                     leave_out(error)
                     results = []
                 score = score_of(
-                    trial, results, objective, num_env_steps=earlier.stop.num_env_steps,
-                    num_iterations=earlier.stop.num_iterations, threshold=threshold,
+                    trial, results, objective, num_env_steps=num_env_steps, num_iterations=num_iterations,
+                    threshold=threshold, longest=longest,
                 )  # fmt: skip
             judged.append(trial.model_copy(update={"objective_score": score}))
     return judged

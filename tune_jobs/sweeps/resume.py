@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ParamSpec
 
-from analysis.records import FINISHED, ReplicationRecord
+from analysis.records import FINISHED, FORMAT_VERSION, ReplicationRecord
 from policies.envs.modules import allow_modules
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine
@@ -154,11 +154,15 @@ def _taken_over(
 
 def _notes_on_version(store: Sweep) -> tuple[str, ...]:
     """Return the note on a sweep that another version of tune-jobs began; empty if it was this one, or is not known."""
-    began, here = (found.get("tune-jobs") for found in (store.read_record().versions, versions()))
-    if None in (began, here) or began == here:
+    record = store.read_record()
+    began, here = (found.get("tune-jobs") for found in (record.versions, versions()))
+    # What is got from a repository may have the number of the last release.
+    is_earlier = record.format_version < FORMAT_VERSION
+    if not is_earlier and (None in (began, here) or began == here):
         return ()
+    begun_with = f"an earlier tune-jobs ({began or 'no number'})" if is_earlier else f"tune-jobs {began}"
     note = (
-        f"The sweep was begun with tune-jobs {began}, and what is left of it trains as tune-jobs {here} does: with "
+        f"The sweep was begun with {begun_with}, and what is left of it trains as tune-jobs {here} does: with "
         'other numbers than trials that ended before, where the changelog says so under "Changes results".'
     )
     return (note,)

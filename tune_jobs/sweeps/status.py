@@ -283,7 +283,7 @@ def status_of(
         env_steps_per_s=None if so_far is None else so_far.env_steps_per_s,
         time_left_s=None if so_far is None else so_far.time_left_s,
         best=best,
-        lacks_seeds=not alive and best is not None and _lacks_seeds(store, record),
+        lacks_seeds=not alive and lacks_seeds(store, record, trials),
     )
 
 
@@ -311,12 +311,18 @@ def _confirmed(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord])
     return BestSoFar(at.trial_id, at.iteration, at.num_env_steps, best.point, best.seed, best.selection_score)
 
 
-def _lacks_seeds(store: Sweep, record: SweepRecord) -> bool:
-    """Whether a sweep was ended between its trials and its `confirm`, as far as its record alone tells."""
+def lacks_seeds(store: Sweep, record: SweepRecord, trials: Sequence[TrialRecord]) -> bool:
+    """Whether a sweep was ended between its trials and its `confirm`, as far as its records tell without its results.
+
+    Args:
+        store: The sweep.
+        record: Its record.
+        trials: Its trials, of which one at least must have an evaluation that may win.
+    """
     from tune_jobs.plan.points import num_points_of
     from tune_jobs.sweeps.confirm import largest_race
 
-    if record.state != "completed" or record.replications or store.has_best():
+    if record.state != "completed" or record.replications or store.has_best() or _best(trials) is None:
         return False
     try:
         spec = stored_spec(record)

@@ -125,10 +125,10 @@ def _rows(trials: Sequence[TrialRecord]) -> list[dict[str, Any]]:
 def _curves(results: Mapping[str, Sequence[IterationRecord]]) -> dict[str, Columns]:
     most = min(_MOST_OF_ONE, max(_LEAST_OF_ONE, _MAX_POINTS // max(1, len(results))))
     found = {}
-    for trial_id in sorted(results):
+    for trial_id, rows in sorted(results.items()):
         curve = Curve()
-        curve.append(results[trial_id])
-        if len(curve):
+        curve.append(rows)
+        if rows:
             found[trial_id] = curve.columns(most)
     return found
 

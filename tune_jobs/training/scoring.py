@@ -10,8 +10,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import ValidationError
+
 from analysis.objectives import score_so_far
 from analysis.records import IterationRecord, Objective, SweepRecord, whole_length
+from policies.errors import SpecError
+from policies.hyperparams import make_hyperparams
+from tune_jobs.plan.estimates import planned_env_steps
+from tune_jobs.search.points import largest_hyperparams
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.progress import Progress
 
@@ -22,7 +28,7 @@ class Judging:
 
     objective: Objective
     num_env_steps: int
-    """The env steps that the trial is to have; for `steps_to_threshold` those of the sweep."""
+    """The env steps that the trial is to have; for `steps_to_threshold` those of the longest."""
     threshold: float | None = None
     """The return to reach, for `steps_to_threshold`."""
     at_evaluations: bool = False
@@ -49,8 +55,18 @@ def judging_of(
     # A record of a former version may not know the env's own.
     threshold = sweep.env_threshold if objective.threshold is None else objective.threshold
     if spec.search.has_model and objective.type == "steps_to_threshold" and threshold is not None:
-        return Judging("steps_to_threshold", all_steps, threshold, at_evaluations=compares)
+        return Judging("steps_to_threshold", _longest(spec, hyperparams), threshold, at_evaluations=compares)
     return None
+
+
+def _longest(spec: SweepSpec, hyperparams: Mapping[str, Any] | None) -> int:
+    """Return the env steps of the longest trial that the sweep may have: all of its trials are told the same."""
+    try:
+        like = make_hyperparams(spec.algorithm, dict(hyperparams or {}))
+        return max(planned_env_steps(spec, values) for values in largest_hyperparams(spec, [like]))
+    except (ValidationError, SpecError):
+        # Of a record that another version has written, or there are too many combinations to check.
+        return spec.stop.num_env_steps
 
 
 class RunningScore:
