@@ -21,9 +21,9 @@ def seeds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     found: list[int] = []
     add = Stack.add
 
-    def noting(self: Stack, member: AnyMember, env_seed: int) -> None:  # type: ignore[type-arg]
+    def noting(self: Stack, member: AnyMember, env_seed: int, *rest: int) -> None:  # type: ignore[type-arg]
         found.append(env_seed)
-        add(self, member, env_seed)
+        add(self, member, env_seed, *rest)
 
     monkeypatch.setattr(Stack, "add", noting)
     return found
