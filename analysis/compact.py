@@ -1,4 +1,4 @@
-"""The iterations of a trial, in a tenth of the memory that their records take.
+"""The iterations of a trial, in about a tenth of the memory that their records take.
 
 A record takes some 3.5 kB, most of it for the names of its values and for Python's numbers, and a thousand trials may
 have a million of them. Here are the bare numbers, one column behind the other.

@@ -12,13 +12,11 @@ from collections.abc import Callable, Iterable, Sequence
 from analysis.objectives import SettingScores, reached_goal
 from analysis.racing import Race, race_within
 from analysis.records import IterationRecord, ReplicationRecord, SweepRecord, TrialRecord
-from policies.errors import TuneJobsError
 from policies.portable.file import BASELINE_KINDS
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.opening import resume_command
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.settings import ranked, threshold_for
 
@@ -54,21 +52,6 @@ def points_to_confirm(store: Sweep) -> tuple[int, ...]:
     if race is None or are_all_alike(line for trial in before for line in results.get(trial.trial_id, ())):
         return ()
     return race.next_points(_scores(ranked_of(trials)), num_done)
-
-
-def what_is_left_out(store: Sweep) -> str | None:
-    """Return a sentence on more seeds that a sweep's `confirm` would give now, and how it does; None: it would not."""
-    try:
-        wanted = points_to_confirm(store)
-    except TuneJobsError:
-        # Who wants them is told what is wrong.
-        return None
-    if not wanted:
-        return None
-    command = resume_command(store, store.read_record())
-    settings = len(set(wanted))
-    told = f"the {settings} leading settings got no more seeds (confirm), as nothing followed the trials"
-    return f"{told}: `{command}` does both."
 
 
 def race_under_way(

@@ -14,8 +14,9 @@ from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.process.interruption import current
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.opening import resume_command
 from tune_jobs.sweeps.adding import add_what_is_missing
-from tune_jobs.sweeps.confirm import points_to_confirm, what_is_left_out
+from tune_jobs.sweeps.confirm import points_to_confirm
 from tune_jobs.sweeps.drawing import import_ahead
 from tune_jobs.sweeps.drive import Shared, close_if_open, run_trials_of
 from tune_jobs.sweeps.finishing import finish_sweep
@@ -118,8 +119,7 @@ def _run_sweep(
     if result.interrupted:
         return result
     if not finish:
-        left_out = what_is_left_out(store)
-        return replace(result, notes=() if left_out is None else (left_out,))
+        return replace(result, notes=_what_is_left_out(store))
     if current().came:
         return replace(result, interrupted=True)
     result = finish_sweep(store, result, progress, keep=had_all)
@@ -131,6 +131,19 @@ def _own_rounds(store: Sweep, *, finish: bool) -> MoreSeeds | None:
     if last_race(store.read_record()) is not None:
         return MoreSeeds(lambda: next_round(store), RACE)
     return MoreSeeds(lambda: _round_of_confirm(store), "confirm") if finish else None
+
+
+def _what_is_left_out(store: Sweep) -> tuple[str, ...]:
+    """Return a note on more seeds that the sweep's `confirm` would have given now; none, if it would not."""
+    try:
+        wanted = points_to_confirm(store)
+    except TuneJobsError:
+        # Who wants them is told what is wrong.
+        return ()
+    command = resume_command(store, store.read_record())
+    settings = len(set(wanted))
+    told = f"the {settings} leading settings got no more seeds (confirm), as nothing was to follow the trials"
+    return (f"{told}: `{command}` does both.",) if wanted else ()
 
 
 def _round_of_confirm(store: Sweep) -> ReplicationRecord | None:
