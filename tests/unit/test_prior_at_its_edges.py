@@ -30,3 +30,12 @@ def test_those_that_were_ended_early_do_not_tell_the_scale_of_those_that_were_no
     (told, *own) = with_prior([*ended, *whole, KnownPoint({"lr": 1e-2}, (50.0,))], [prior_of(1.0)])
     assert (told.score, told.level) == (50.0, None)
     assert [item.score for item in own[:2]] == [0.0, 1.0]
+
+
+def test_own_failures_count_for_the_rank_as_the_earlier_sweeps_did_for_the_share() -> None:
+    """Half of both sweeps failed: the worst of the earlier one's others were told as what the middle here reached."""
+    scored = [KnownPoint({"lr": 1e-2}, (float(score),)) for score in range(11)]
+    failed = [KnownPoint({"lr": 1e-2}, (None,)) for _ in range(10)]
+    # Places of 21: the 11th, the 16th and the last one; 0.3 is a failed one's, and no score is below the worst.
+    told = with_prior([*scored, *failed], [prior_of(0.5, 0.75, 1.0, 0.3)])[:4]
+    assert [item.score for item in told] == [0.0, 5.0, 10.0, 0.0]

@@ -190,3 +190,11 @@ def test_a_drawn_point_of_the_forest_that_was_tried_is_not_tried_again_where_som
         point = next_point("forest", space, known, index, seed=4)
         assert all(item.point != point for item in known), index
         known.append(KnownPoint(point, (float(point["n_step"] - (point["replay"] == "prioritized")),)))
+
+
+def test_settings_are_found_anew_as_seldom_at_thousands_of_points() -> None:
+    """Finding them takes longer than all else, and was due at each tenth point, however many there were."""
+    found = [gp._by_tenths(number) for number in range(10, 5_001)]
+    assert all(number * 0.9 < each <= number for number, each in enumerate(found, start=10))
+    assert found == sorted(found[:90]) + sorted(found[90:])
+    assert len(set(found[990:])) <= 18  # 1.1 ** 17 is 5

@@ -379,3 +379,21 @@ def test_further_seeds_that_wait_do_not_hide_a_point_from_the_model() -> None:
     further = record(1, point, status="pending", point_index=0).model_copy(update={"seed_index": 1})
     (known,) = known_points(spec, [record(0, point, 3.0, point_index=0), further])
     assert (known.is_running, known.scores) == (False, (3.0,))
+
+
+@each_method
+def test_failures_alone_tell_no_more_of_where_something_is_to_be_found(method: str) -> None:
+    """One failed trial among equally bad ones, and a model went to the corners that are farthest from it."""
+    spec = make_spec(method=method, startup=4)
+    scores = [None if index == 3 else -200.0 for index in range(20)]
+    records = [
+        record(index, draw_point(spec.space, index, spec.seed), score, status="completed" if score else "failed")
+        for index, score in enumerate(scores)
+    ]
+
+    def propose(known: Sequence[TrialRecord]) -> dict[str, Any]:
+        return propose_point(spec, known, len(known), lambda point: None)
+
+    assert propose(records) == draw_point(spec.space, 20, spec.seed)
+    better = record(20, draw_point(spec.space, 20, spec.seed), -150.0)
+    assert propose([*records, better]) != draw_point(spec.space, 21, spec.seed)

@@ -11,6 +11,7 @@ from tests.narrowing import present
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.proposal import propose_point
 from tune_jobs.search.two_objectives import weighed
+from tune_jobs.spec.draws import draw_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 
@@ -96,3 +97,39 @@ def test_points_are_known_with_what_their_trainings_took() -> None:
     (known,) = known_points(spec, records)
     assert known.env_steps == (50_176, 50_000, 50_000)
     assert len(known.scores) == 3
+
+
+def test_one_training_that_diverged_leaves_scores_their_say() -> None:
+    """Beside minus a million all others lost nothing, and every weight asked for the cheapest."""
+    rng = np.random.default_rng(0)
+    known = [
+        KnownPoint({"x": at}, (float(500 * rng.random()),), env_steps=(int(rng.integers(5_000, 100_000)),))
+        for at in range(30)
+    ]
+    cheapest = min(range(30), key=lambda at: known[at].env_steps)
+    for others in ([], [KnownPoint({"x": 30}, (-1e6,), env_steps=(50_000,))]):
+        wins = [int(np.argmax(numbers([*known, *others], index))) for index in range(100)]
+        assert 0 < wins.count(cheapest) < 50
+        assert len(set(wins)) >= 3
+        # What diverged is the last of all where the score counts.
+        assert any(int(np.argmin(numbers([*known, *others], index))) == 30 for index in range(100)) == bool(others)
+
+
+@each_method
+def test_as_long_as_nothing_is_learnt_the_search_does_not_go_for_the_shortest_trainings(method: str) -> None:
+    spec = spec_of(method, ["return", "env_steps"])
+    points = [draw_point(spec.space, index, spec.seed) for index in range(20)]
+    records = [record(at, point, -200.0, steps=point[LENGTH]) for at, point in enumerate(points)]
+    assert propose_point(spec, records, 20, lambda _: None) == draw_point(spec.space, 20, spec.seed)
+    better = [*records[:19], record(19, points[19], -150.0, steps=points[19][LENGTH])]
+    assert propose_point(spec, better, 20, lambda _: None) != draw_point(spec.space, 20, spec.seed)
+
+
+@each_method
+def test_where_no_length_is_searched_equal_scores_are_told_apart_by_what_they_took(method: str) -> None:
+    """A training that is solved ends early: of those that reach the same, the one that got there first is better."""
+    whole = spec_of(method, ["return", "env_steps"])
+    spec = whole.model_copy(update={"space": {name: each for name, each in whole.space.items() if name != LENGTH}})
+    points = [draw_point(spec.space, index, spec.seed) for index in range(20)]
+    records = [record(at, point, 500.0, steps=5_000 + 1_000 * at) for at, point in enumerate(points)]
+    assert propose_point(spec, records, 20, lambda _: None) != draw_point(spec.space, 20, spec.seed)

@@ -38,6 +38,8 @@ _FIRST_BETA, _BETA_RATE = 0.2, 0.4
 _NUM_CANDIDATES, _NUM_NEAR = 300, 100
 _MOST = 2.0
 """Standardised gains beyond this many deviations count as this many, as one collapse must not be all that is seen."""
+_MOST_LOSS = 16.0
+"""A loss counts for at most so many times the greatest gain: else a collapse to minus a million is the deviation."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,9 @@ class _Model:
     @classmethod
     def fitted(cls, times: Floats, rows: Floats, gains: Floats) -> _Model:
         """Return the model whose settings make the gains likeliest."""
+        middle = np.median(gains)
+        if (greatest := gains.max() - middle) > 0:
+            gains = np.maximum(gains, middle - _MOST_LOSS * greatest)
         spread = gains.std()
         targets = np.clip((gains - gains.mean()) / (spread if spread > 0 else 1.0), -_MOST, _MOST)
         best: tuple[float, float, float, float] | None = None

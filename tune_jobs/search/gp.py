@@ -58,12 +58,22 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
 def _settings(cube: Cube, known: Sequence[KnownPoint]) -> Settings:
     """Return the settings of the process, of the first points that ended, whose number grows by tenths."""
     num_ended = sum(not point.is_running for point in known)
-    num_first = num_ended - num_ended % max(1, num_ended // 10)
+    num_first = _by_tenths(num_ended)
     ended = [point for point in known if not point.is_running]
     first = [point for point in known[:num_first] if not point.is_running]
     seen, _ = observed(cube, first or ended, _MOST_FITTED)
     groups = tuple(map(int, cube.group_of_column))
     return _fitted(seen.columns.tobytes(), seen.means.tobytes(), seen.counts.tobytes(), seen.spread, groups)
+
+
+def _by_tenths(number: int) -> int:
+    """Return the largest number up to this one that is a tenth above the one before it."""
+    if number < 100:
+        return number - number % max(1, number // 10)
+    found = 100
+    while (larger := found + found // 10) <= number:
+        found = larger
+    return found
 
 
 @functools.lru_cache(maxsize=8)

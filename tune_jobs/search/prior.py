@@ -171,25 +171,27 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
         return list(known)
     earlier = [item for each in prior for item in each.points]
     ended = [point for point in known if not point.is_running]
-    scored = sorted((point for point in ended if point.score is not None), key=rank_of)
-    if sum(point.level is None for point in scored) >= _ENOUGH:
-        return [*(_like_own(item, scored) for item in earlier), *known]
+    if sum(point.level is None and point.score is not None for point in ended) >= _ENOUGH:
+        ordered = sorted(ended, key=rank_of)
+        return [*(_like_own(item, ordered) for item in earlier), *known]
     shares = iter(map(float, shares_of(ended)))
     own = [point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known]
     return [*(KnownPoint(item.point, (item.share,), is_own=False) for item in earlier), *own]
 
 
-def _like_own(item: PriorPointRecord, scored: Sequence[KnownPoint]) -> KnownPoint:
-    """Return an earlier sweep's point with what the own point of its rank reached.
+def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint]) -> KnownPoint:
+    """Return an earlier sweep's point with what the own point of its rank reached; if that failed, the worst's score.
 
     Args:
         item: The point.
-        scored: The own points that have a score, the worst first.
+        ordered: The own points that ended, the worst first: those that failed, and some that have a score. What failed
+            counts here as it did for the share.
     """
     if item.share is None:
         return KnownPoint(item.point, (None,), is_own=False)
-    place = item.share * (len(scored) - 1)
-    worse, better = scored[math.floor(place)], scored[math.ceil(place)]
+    num_failed = sum(point.score is None for point in ordered)
+    place = max(item.share * (len(ordered) - 1), num_failed)
+    worse, better = ordered[math.floor(place)], ordered[math.ceil(place)]
     part = place - math.floor(place)
     nearest = better if part >= 0.5 else worse
     score = nearest.score
@@ -202,11 +204,17 @@ def _share_of(point: KnownPoint, share: float) -> float | None:
     return None if point.score is None else share
 
 
-def prior_notes(spec: SweepSpec, prior: Sequence[PriorRecord]) -> tuple[str, ...]:
-    """Return the plan's notes on what a search begins with."""
+def prior_notes(spec: SweepSpec, prior: Sequence[PriorRecord], env_id: str = "") -> tuple[str, ...]:
+    """Return the plan's notes on what a search begins with.
+
+    Args:
+        spec: The sweep.
+        prior: What its search begins with.
+        env_id: Its env's id with the version, as records have it; the sweep file may leave that out.
+    """
     notes = []
     for each in prior:
-        other = "" if each.env_id == spec.env.id else f", of {shortened(each.env_id)}, by their ranks there"
+        other = "" if each.env_id in (spec.env.id, env_id) else f", of {shortened(each.env_id)}, by their ranks there"
         number, all_ended = len(each.points), each.num_ended
         what = counted(number, "point")
         if all_ended is not None and all_ended > number:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from analysis.points import meaning_of
-from analysis.records import PriorRecord, TrialRecord
+from analysis.records import TRAINING_LENGTH, PriorRecord, TrialRecord
 from policies import random_streams
 from policies.errors import CannotRunError, SpecError
 from tune_jobs.search.asking import Check, Method, Question
@@ -44,6 +44,8 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 
 _NUM_DRAWN = 1_000
 """Random points of which one has values that go together, or the search ends."""
+_MANY_FAILED = 1 / 3
+"""From this share on, a model is told of failures even where all others are equally good."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,9 @@ def propose_point(
         CannotRunError: What the method needs is not installed.
     """
     known = (history or History(spec)).known_points(records)
-    if spec.objective.cost is not None:
+    # Where all scores are equal nothing was learnt, and of trainings that learn nothing the shortest is no find.
+    is_told_by_cost = TRAINING_LENGTH in spec.space and _are_all_equal(with_prior(known, prior))
+    if spec.objective.cost is not None and not is_told_by_cost:
         known = weighed(known, drawn_index, spec.seed)
         prior = [weighed_prior(each, drawn_index, spec.seed) for each in prior]
     return next_point(
@@ -171,14 +175,17 @@ def next_point(
 
 
 def _are_all_equal(known: Sequence[KnownPoint]) -> bool:
-    """Return whether nothing tells points that ended apart.
+    """Return whether nothing tells points that ended apart, but a few that failed.
 
     A model of them knows but where they are. It would go where they are not, and most of such places are in corners of
-    the space, while what is to be found is usually in none (decision 40).
+    the space, while what is to be found is usually in none (decision 40). A few failures say as little: the model would
+    go as far from them as it can. Of many it learns what to leave out.
     """
-    ended = (rank_of(point) for point in known if not point.is_running)
-    first = next(ended, None)
-    return all(rank == first for rank in ended)
+    ended = [point for point in known if not point.is_running]
+    scored = [point for point in ended if point.score is not None]
+    ranks = map(rank_of, scored if len(ended) - len(scored) < _MANY_FAILED * len(ended) else ended)
+    first = next(ranks, None)
+    return all(rank == first for rank in ranks)
 
 
 def _valid_draw(space: Mapping[str, Domain], index: int, seed: int, check: Check) -> dict[str, Any]:
