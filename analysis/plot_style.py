@@ -5,11 +5,13 @@ Figures are built with matplotlib's object interface, not with pyplot, so there 
 
 from __future__ import annotations
 
+import contextlib
 import html
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -42,6 +44,9 @@ LINES = ("-", "--", "-.", ":")
 _MAX_GROUP_VALUES = len(PALETTE)
 MAX_DRAWN = 1e100
 _DPI_OF_SVG = 72
+_FONTS = ("font.", "mathtext.", "text.latex.", "text.usetex")
+_styled = threading.RLock()
+"""Held by the thread that has changed matplotlib's settings, which are the process's."""
 _CSS_NAMES = {INK: "ink", MUTED: "muted", GRID: "grid", ACCENT: "accent"} | {
     color: f"series-{i}" for i, color in enumerate(PALETTE)
 }
@@ -145,6 +150,25 @@ def group_styles(trials: Sequence[TrialRecord], names: Sequence[str]) -> dict[st
         for number, key in enumerate(dict.fromkeys(keys.values()))
     }
     return {trial_id: styles[key] for trial_id, key in keys.items()}
+
+
+@contextlib.contextmanager
+def own_style(*, fonts: bool = True) -> Iterator[None]:
+    """Make and save the figures of the block as they are meant, whatever style the caller has set for others.
+
+    Args:
+        fonts: Whether this is so of fonts, too, and of TeX, which may not be there; of a paper's they are the caller's.
+    """
+    import matplotlib as mpl
+    from matplotlib import style
+
+    with _styled:
+        kept: dict[str, Any] = {}
+        if not fonts:
+            # Not by `items`: to ask for the backend loads it.
+            kept = {name: mpl.rcParams[name] for name in mpl.rcParams if name.startswith(_FONTS)}
+        with style.context(["default", kept]):
+            yield
 
 
 def new_figure(size: tuple[float, float]) -> Figure:

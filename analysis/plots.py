@@ -211,7 +211,7 @@ def score_per_episode(
     goal_line(left, goal)
     # The trend of a policy that scores the maximum goes beyond any possible score, so it must not set the scale.
     low, high = float(scores.min()), max(float(scores.max()), goal if goal is not None else -np.inf)
-    left.set_ylim(min(0.0, low), high + 0.06 * max(high - min(0.0, low), 1.0))
+    left.set_ylim(min(0.0, low), high + 0.06 * (high - min(0.0, low) or 1.0))
     add_legend(figure, left, [], size, below=True)
     last = scores[-_HISTOGRAM_EPISODES:]
     # The bins cover the range of the whole training, so that fifty equal scores are one bar at their height.

@@ -344,6 +344,10 @@ class SweepRecord(RewrittenRecord):
         None, description="The trial that it repeats, SWEEP/TRIAL, and has alone; None: it is no repetition."
     )
     env_threshold: float | None = Field(None, description="The env's own threshold when it was planned, if it has one.")
+    env_spaces: dict[str, str] = Field(
+        default_factory=dict,
+        description="The shapes of the env's observations and actions when trials were last planned; empty: not known.",
+    )
     is_flattened: bool = Field(
         default=False,
         description="Whether the env's own observations were neither vectors nor images; False in older records.",

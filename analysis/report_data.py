@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from analysis.wording import duration
 from policies.portable.file import BASELINE_KINDS
 
 _ATARI_FRAMES = ("frame_skip", "noop_max")
+_VERSION = re.compile(r"-v\d+")
 
 
 def goal_of(sweep: SweepRecord, best: BestRecord | None) -> float | None:
@@ -39,6 +41,15 @@ def env_of(sweep: SweepRecord) -> str:
     """Return the env id of a sweep, from its resolved spec."""
     env = sweep.spec.get("env")
     return str(env.get("id", "?")) if isinstance(env, Mapping) else str(env)
+
+
+def are_one_env(first: str, second: str) -> bool:
+    """Return whether two env ids may be of one environment.
+
+    Earlier records have the id as it was typed, perhaps without its version, and don't tell which one it meant.
+    """
+    short, long = sorted((first, second), key=len)
+    return first == second or _VERSION.fullmatch(long.removeprefix(short)) is not None
 
 
 def env_arguments_of(sweep: SweepRecord) -> dict[str, Any]:

@@ -6,6 +6,7 @@ become Python's, and paths of other libraries become pathlib's.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import math
@@ -14,6 +15,7 @@ import os
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -43,6 +45,8 @@ Inches = Annotated[float, Range(1, 100)]
 def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorate a function so that its arguments are checked against its annotations.
 
+    NumPy's errors are what they are by default while it runs, whatever the caller has made of them.
+
     Raises:
         SpecError: Raised by the decorated function when an argument has a wrong type.
     """
@@ -67,9 +71,23 @@ def checked(function: Callable[_P, _R]) -> Callable[_P, _R]:
             raise TypeError(f"{function.__name__}() {error}: {takes}.{nearest}") from None
         for name, value in bound.arguments.items():
             bound.arguments[name] = fit_argument(name, value, kinds()[name])
-        return function(*bound.args, **bound.kwargs)
+        with _numpys_own_errors():
+            return function(*bound.args, **bound.kwargs)
 
     return call
+
+
+def _numpys_own_errors() -> AbstractContextManager[object]:
+    """Undo what the caller set of NumPy's errors in the block.
+
+    Where that says "raise", the exponential of -1,000 is one.
+    """
+    # Not there before NumPy is imported, or while another thread does that.
+    errstate: Any = getattr(sys.modules.get("numpy"), "errstate", None)
+    if errstate is None:
+        return contextlib.nullcontext()
+    own: AbstractContextManager[object] = errstate(divide="warn", over="warn", under="ignore", invalid="warn")
+    return own
 
 
 def fit_argument(name: str, value: Any, kind: Any) -> Any:

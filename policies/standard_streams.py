@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 _STREAMS = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
 
@@ -28,6 +29,18 @@ def standard_streams() -> Iterator[None]:
                 stack.callback(setattr, sys, name, None)
                 setattr(sys, name, stack.enter_context(Path(os.devnull).open(mode, encoding="utf-8")))
         yield
+
+
+def has_standard_error() -> bool:
+    """Whether descriptor 2 is standard error; else it is closed, or a file that was opened where that was missing."""
+    return sys.__stderr__ is not None and _is_open(2)
+
+
+def for_child(name: Literal["stdout", "stderr"]) -> int | None:
+    """Return what `Popen` is given for a child's stream: the one of this process, or nowhere if that has none."""
+    import subprocess
+
+    return subprocess.DEVNULL if getattr(sys, f"__{name}__") is None else None
 
 
 def _is_open(number: int) -> bool:

@@ -62,6 +62,8 @@ _HOME = {
     **dict.fromkeys(_SWEEPS, "tune_jobs.sweeps.verbs"),
 }
 
+__all__ = sorted(_HOME)  # noqa: PLE0605 (as written above)
+
 # This comes before anything of policies or analysis is imported.
 _own_packages.install()
 

@@ -89,10 +89,7 @@ def _pale_lines(subject: Subject, in_top: set[str]) -> tuple[list[Line], tuple[s
     num_left_out = len(with_curve) - len(drawn)
     notes = (f"{len(drawn)} of the {len(with_curve):,} other trials are drawn.",) if num_left_out else ()
     curves = [curve(subject, trial.trial_id, _NUM_PALE_POINTS) for trial in drawn]
-    if not curves:
-        return [], notes
-    name = "other trials"
-    lines = [Line(name, "muted", *_joined(curves), look="pale")]
+    lines = [Line("other trials", "muted", *_joined(curves), look="pale")] if curves else []
     short = [trial for trial in subject.begun if subject.ending(trial) in ("cut", "unfinished")]
     drawn_ids = {trial.trial_id for trial in drawn} | in_top
     ends = [curve(subject, trial.trial_id, _NUM_PALE_POINTS) for trial in short if trial.trial_id in drawn_ids]

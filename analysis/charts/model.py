@@ -22,7 +22,9 @@ Number = float | int | None
 Ending = Literal["whole", "cut", "unfinished", "failed"]
 """How a trial ended: cut early by a scheduler; unfinished: it still runs; failed: or it has no score."""
 Look = Literal["line", "thin", "pale", "dots", "hollow"]
-_NUM_DIGITS = 6
+_NUM_DIGITS = 9
+_MAX_WHOLE = 1e15
+"""Whole numbers below it keep all of their digits, as in the tables."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ def to_json(charts: Sequence[Chart], colors: dict[str, dict[str, str]]) -> str:
 
 
 def _plain(value: Any, without: Sequence[str] = ()) -> Any:
-    """Return dataclasses as dicts, without fields that have their defaults, and floats with six digits."""
+    """Return dataclasses as dicts, without fields that have their defaults, and floats with nine digits."""
     if dataclasses.is_dataclass(value):
         return {
             field.name: _plain(getattr(value, field.name))
@@ -226,6 +228,9 @@ def _plain(value: Any, without: Sequence[str] = ()) -> Any:
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     if isinstance(value, float):
+        # Counts are floats, too, where they come from arrays.
+        if value.is_integer() and abs(value) < _MAX_WHOLE:
+            return int(value)
         finite = drawable(value)
         return None if finite is None else float(f"{finite:.{_NUM_DIGITS}g}")
     return value

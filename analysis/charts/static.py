@@ -26,6 +26,7 @@ from analysis.charts.model import (
     Trials,
 )
 from analysis.plot_style import CSS_LIGHT, INK, MUTED, PALETTE, RAMP, escape, goal_line, new_figure, style_axes
+from analysis.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,6 +38,11 @@ _PALE = 0.12
 _COLUMNS = 3
 _PANEL_HEIGHT = 2.9
 _LABEL_CHARS = 24
+_MAX_TICKS = 16
+_MAX_ROW_TICKS = 24
+_CROWDED = 40
+"""Characters that the labels beneath a panel have side by side at most."""
+_KEY_COLUMNS = 4
 _HATCHED: dict[Ending, str] = {
     "cut": "cut early by a scheduler",
     "unfinished": "not ended yet",
@@ -114,21 +120,27 @@ def _draw_plot(plot: Plot, axes: Axes) -> None:
 
 
 def _draw_panels(trials: Trials) -> Figure:
-    figure, all_axes = _grid(len(trials.columns), _PANEL_HEIGHT, 1)
+    handles, labels = _panel_keys(trials)
+    figure, all_axes = _grid(len(trials.columns), _PANEL_HEIGHT, math.ceil(len(labels) / _KEY_COLUMNS))
     colors = _colors(trials.columns[0])
     for column, axes in zip(trials.columns, all_axes, strict=True):
         _scale(axes, column.axis, vertical=False)
         style_axes(axes, xlabel=escape(column.axis.name), ylabel=escape(trials.score.name.partition(",")[0]))
         _panel_dots(trials, column, axes, colors)
-    handles, labels = _ending_handles(trials)
-    if trials.columns[0].axis.kind == "category":
-        first = trials.columns[0]
-        handles = [_dot(_category_color(index), filled=True) for index in range(len(first.axis.labels))] + handles
-        labels = [f"{first.axis.name} {label}" for label in first.axis.labels] + labels
-    else:
+    if trials.columns[0].axis.kind != "category":
         _color_bar(figure, all_axes, trials.columns[0])
-    _legend(figure, handles, [escape(label) for label in labels], columns=4)
+    _legend(figure, handles, [escape(label) for label in labels], columns=_KEY_COLUMNS)
     return figure
+
+
+def _panel_keys(trials: Trials) -> tuple[list[Any], list[str]]:
+    """Return the marks of the legend with their texts; categories that share a colour are one of them."""
+    handles, labels = _ending_handles(trials)
+    axis = trials.columns[0].axis
+    names = [f"{axis.name} {label}" for label in axis.labels[: len(PALETTE)]]
+    if num_others := len(axis.labels) - len(names):
+        names.append(counted(num_others, "other value"))
+    return [_dot(_category_color(index), filled=True) for index in range(len(names))] + handles, names + labels
 
 
 def _panel_dots(trials: Trials, column: Column, axes: Axes, colors: Sequence[Any]) -> None:
@@ -223,7 +235,7 @@ def _draw_timeline(data: Timeline) -> Figure:
         width, color = max(bar.end - bar.start, 1e-9), CSS_LIGHT[f"--{bar.color}"]
         axes.barh(bar.row, width, left=bar.start, height=0.8, color=color)
     style_axes(axes, xlabel=escape(data.x.name), ylabel=escape(data.y.name))
-    shown = np.unique(np.linspace(0, rows - 1, min(rows, 24)).round().astype(int))
+    shown = _spread(rows, _MAX_ROW_TICKS)
     axes.set_yticks(shown, [escape(data.y.labels[row]) for row in shown], fontsize=8)
     axes.invert_yaxis()
     statuses = dict.fromkeys((bar.status, bar.color) for bar in data.bars)
@@ -236,7 +248,10 @@ def _scale(axes: Axes, axis: Axis, *, vertical: bool) -> None:
     own = axes.yaxis if vertical else axes.xaxis
     set_limits = axes.set_ylim if vertical else axes.set_xlim
     if axis.kind == "category":
-        own.set_ticks(range(len(axis.labels)), [escape(label[:_LABEL_CHARS]) for label in axis.labels], fontsize=8)
+        shown = _spread(len(axis.labels), _MAX_TICKS)
+        texts = [axis.labels[index][:_LABEL_CHARS] for index in shown]
+        is_turned = not vertical and sum(map(len, texts)) > _CROWDED
+        own.set_ticks(shown, [escape(text) for text in texts], fontsize=8, rotation=90 if is_turned else 0)
         set_limits(-0.5, len(axis.labels) - 0.5)
     elif axis.kind == "log":
         (axes.set_yscale if vertical else axes.set_xscale)("log")
@@ -246,6 +261,11 @@ def _scale(axes: Axes, axis: Axis, *, vertical: bool) -> None:
         own.set_major_locator(MaxNLocator(6))
         if "env steps" in axis.name:
             own.set_major_formatter(EngFormatter(sep=""))
+
+
+def _spread(num: int, most: int) -> list[int]:
+    """Return the places of so many categories, or as many of them as have room for labels, spread evenly."""
+    return sorted(set(np.linspace(0, num - 1, min(num, most)).round().astype(int).tolist()))
 
 
 def _array(values: Sequence[Number]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -14,7 +14,7 @@ from analysis.comparison.repetition import same_numbers
 from analysis.exports.frames import ranked_settings
 from analysis.objectives import failed_score
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
-from analysis.report_data import env_arguments_of, env_of
+from analysis.report_data import are_one_env, env_arguments_of, env_of
 from analysis.wording import counted
 
 MAX_ENTRIES = len(string.ascii_uppercase)
@@ -73,7 +73,7 @@ def compare(wanted: Sequence[Wanted], objective: Objective | None = None) -> Com
     pairs = () if reasons else tuple(make_pair(one, other, ready) for one, other in _pairs(entries))
     notes += [*_told_of_each(wanted, entries), *_told_of_all(wanted, entries, longest)]
     if any(entry.num_failed for entry in entries):
-        one_sweep = len({(item.sweep.name, item.sweep.created_at) for item in wanted}) == 1
+        one_sweep = len({item.origin for item in wanted}) == 1
         notes.append(_told_of_failures(chosen, of_its_sweep=one_sweep or bool(reasons)))
     return Comparison(entries, pairs, chosen, tuple(reasons), tuple(notes), failed, longest)
 
@@ -127,7 +127,7 @@ def why_not_comparable(sweeps: Sequence[SweepRecord], names: Sequence[str]) -> l
     first, env_id, arguments = names[0], env_of(sweeps[0]), env_arguments_of(sweeps[0])
     reasons = []
     for sweep, name in zip(sweeps[1:], names[1:], strict=True):
-        if env_of(sweep) != env_id:
+        if not are_one_env(env_of(sweep), env_id):
             reasons.append(
                 f"{first} is on {env_id}, {name} on {env_of(sweep)}: returns of different environments are on "
                 "different scales."
@@ -142,16 +142,18 @@ def why_not_comparable(sweeps: Sequence[SweepRecord], names: Sequence[str]) -> l
 
 def _told_of_each(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:
     notes = []
-    told: set[str] = set()
+    told: set[tuple[str, tuple[str, float]]] = set()
     for item, entry in zip(wanted, entries, strict=True):
         trials = item.data.trials
         left = sum(trial.status not in FINISHED for trial in trials)
-        if left and entry.sweep not in told:
+        # Copies of a sweep may each go on, and others have its name.
+        sweep = (entry.sweep, item.origin)
+        if left and sweep not in told:
             notes.append(
                 f"Sweep {entry.sweep} is {item.sweep.state}: {len(trials) - left} of {counted(len(trials), 'trial')} "
                 "have ended, and the numbers are those so far."
             )
-        told.add(entry.sweep)
+        told.add(sweep)
         if entry.is_sweep and entry.scores and entry.num_settings > 1:
             seeds = "one seed" if len(entry.scores) == 1 else f"{len(entry.scores)} seeds"
             notes.append(
@@ -188,8 +190,9 @@ def _same_trainings(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[
     notes = []
     for one, other in itertools.combinations(range(len(wanted)), 2):
         pair = (wanted[one], wanted[other])
-        same_sweep = entries[one].sweep == entries[other].sweep
-        if same_sweep or why_not_comparable([item.sweep for item in pair], [item.name for item in pair]):
+        # What copies of a sweep have in common is told where they are read.
+        of_one_sweep = pair[0].origin == pair[1].origin
+        if of_one_sweep or why_not_comparable([item.sweep for item in pair], [item.name for item in pair]):
             continue
         if same := _num_same(*pair):
             notes.append(

@@ -31,6 +31,16 @@ class Wanted:
     point_index: int | None = None
     """The setting; None: the sweep, by its leading one."""
 
+    @property
+    def sweep_name(self) -> str:
+        """What the sweep is found by: the record of one whose folder was renamed still has its former name."""
+        return self.name.partition("/")[0]
+
+    @property
+    def origin(self) -> tuple[str, float]:
+        """What tells the sweep from all others, also those of its name; a copy of it has the same."""
+        return self.sweep.name, self.sweep.created_at
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -128,7 +138,7 @@ def make_entry(wanted: Wanted, letter: str, alone: SweepData, *, shares_threshol
     entry = Entry(
         letter=letter,
         name=wanted.name,
-        sweep=wanted.sweep.name,
+        sweep=wanted.sweep_name,
         is_sweep=wanted.point_index is None,
         algorithm=str(wanted.sweep.spec.get("algorithm", "?")),
         env_id=env_of(wanted.sweep),

@@ -25,6 +25,7 @@ from analysis.plot_style import (
     escape,
     goal_line,
     new_figure,
+    own_style,
     steps_axis,
     style_axes,
     to_svg,
@@ -172,6 +173,7 @@ def _figures(comparison: Comparison, wanted: Mapping[str, Wanted]) -> list[dict[
     ]
 
 
+@own_style()
 def _svgs(stem: str, title: str, draw: Callable[[Size], Figure | None]) -> dict[str, Any]:
     from markupsafe import Markup
 

@@ -11,7 +11,7 @@ from typing import Any
 from analysis.comparison.entries import Entry, Wanted
 from analysis.exports.frames import ranked_settings
 from analysis.points import meaning_of
-from analysis.records import SweepRecord
+from analysis.records import TRAINING_LENGTH, SweepRecord
 from analysis.statistics import Estimate, iqm, iqm_with_ci, probability_of_improvement, t_quantile
 from analysis.wording import counted, setting_text
 from policies import random_streams
@@ -75,8 +75,7 @@ def make_pair(left: Entry, right: Entry, wanted: Mapping[str, Wanted], *, level:
         wanted: What they were made of, by letter.
         level: That of all intervals.
     """
-    ours, theirs = wanted[left.letter].sweep, wanted[right.letter].sweep
-    of_one_sweep = (ours.name, ours.created_at) == (theirs.name, theirs.created_at)
+    of_one_sweep = wanted[left.letter].origin == wanted[right.letter].origin
     if why := _why_the_same(left, right) if of_one_sweep else "":
         return Pair(left.letter, right.letter, None, why, None, why, None, "")
     probability, why_no_probability = _probability(left, right, level)
@@ -175,7 +174,8 @@ def mean_difference(
 
 def _shared(left: Wanted, right: Wanted, level: float) -> tuple[Shared | None, str]:
     """Compare two sweeps within the settings that both have trained, or say why that can't be done."""
-    ours, theirs = map(_by_meaning, (left, right))
+    with_length = any(TRAINING_LENGTH in each.sweep.section("space") for each in (left, right))
+    ours, theirs = (_by_meaning(each, with_length=with_length) for each in (left, right))
     if not ours or not theirs:
         return None, ""
     why = _why_other_trainings(left, right)
@@ -234,13 +234,19 @@ def _unsearched(sweep: SweepRecord) -> dict[str, Any]:
     return {**defaults, **sweep.section("hyperparams")}
 
 
-def _by_meaning(wanted: Wanted) -> dict[str, tuple[float, ...]]:
+def _by_meaning(wanted: Wanted, *, with_length: bool) -> dict[str, tuple[float, ...]]:
     """Return the scores of all seeds of each setting; several points may have equal values, or write them otherwise.
 
     A value that one sweep searches and another has fixed, or by default, is the same value. Seeds are in the order in
     which they came to the sweep: those that a race gave come after those that decided who races.
+
+    Args:
+        wanted: The sweep.
+        with_length: Whether settings have the length of training, as one of the sweeps compared searches it.
     """
     unsearched = _unsearched(wanted.sweep)
+    if with_length:
+        unsearched[TRAINING_LENGTH] = wanted.data.num_env_steps
     indices = {trial.trial_id: trial.index for trial in wanted.data.trials}
     seeds: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
     for item in ranked_settings(wanted.data):

@@ -12,7 +12,18 @@ from numpy.typing import NDArray
 
 from analysis.exports.frames import SweepData, ranked_settings
 from analysis.objectives import SettingScores
-from analysis.plot_style import ACCENT, GRID, MARKERS, PALETTE, drawable, escape, new_figure, steps_axis, style_axes
+from analysis.plot_style import (
+    ACCENT,
+    GRID,
+    MARKERS,
+    PALETTE,
+    drawable,
+    escape,
+    new_figure,
+    own_style,
+    steps_axis,
+    style_axes,
+)
 from analysis.points import searched_names
 from analysis.statistics import seed_intervals
 from analysis.tables import cell_value
@@ -115,6 +126,7 @@ def curves_of(data: SweepData, settings: Sequence[SettingScores], *, returns: Re
     ]
 
 
+@own_style(fonts=False)
 def learning_figure(
     sweeps: Sequence[tuple[str, SweepData]],
     *,
@@ -198,6 +210,7 @@ def _fit_returns(axes: Axes, curves: Sequence[Curve], goal: float | None) -> Non
     axes.set_ylim(low - margin, high + margin)
 
 
+@own_style(fonts=False)
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as PDF, SVG or PNG, by the suffix of the path.
 

@@ -11,7 +11,7 @@ from analysis.charts import Chart, Subject, draw, make_charts, to_json
 from analysis.charts.model import Section
 from analysis.page.files import write_figure
 from analysis.page.source import Source
-from analysis.plot_style import CSS_DARK, CSS_LIGHT, page_svg
+from analysis.plot_style import CSS_DARK, CSS_LIGHT, own_style, page_svg
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -35,6 +35,7 @@ class Charts:
     """JSON, for the page's script."""
 
 
+@own_style()
 def make(source: Source, folder: Path, before_each: Callable[[], None] = lambda: None) -> Charts:
     """Make the charts of a sweep, and write each that has data as SVG and PDF.
 

@@ -17,6 +17,8 @@ _ESTIMATED = (
     "Trials of a pack are trained by one process at once, so their own core-seconds are estimated: at any moment they "
     "share its cores by their env steps per second. Processes that step environments for a pack are not counted."
 )
+_FEW_STEPS = 100
+"""Env steps a second below which their fractions are told."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ def _core_seconds(source: Source, num_env_steps: int) -> list[tuple[str, str]]:
     rows = [("core-seconds", text)]
     # Where some trials are not known, a rate would mix the one's env steps with the other's seconds.
     if total > 0 and len(costs) == sum(trial.num_env_steps > 0 for trial in source.trials):
-        rows += [("speed", f"{number(round(num_env_steps / total))} env steps a core-second, evaluations included")]
+        rate = num_env_steps / total
+        text = number(rate if rate < _FEW_STEPS else round(rate))
+        rows += [("speed", f"{text} env steps a core-second, evaluations included")]
     return rows
 
 

@@ -13,7 +13,7 @@ from analysis.page import how_sure
 from analysis.page.files import write_figure
 from analysis.page.scores import score_means
 from analysis.page.source import Source
-from analysis.plot_style import page_svg, to_svg_file
+from analysis.plot_style import own_style, page_svg, to_svg_file
 from analysis.points import searched_names
 from analysis.selection import score_trial
 from analysis.strip_plot import seed_strips
@@ -52,6 +52,7 @@ class DrawnFigure:
     narrow: Markup
 
 
+@own_style()
 def draw_figures(
     source: Source, folder: Path, before_each: Callable[[], None] = lambda: None
 ) -> Mapping[Section, list[DrawnFigure]]:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from analysis.domains import arguments_of, conditions_of, kind_of
+from analysis.numbering import first_index
 from analysis.page.source import Source
-from analysis.records import SweepRecord
+from analysis.records import ChosenPointRecord, SweepRecord
 from analysis.report_data import run_time_of
 from analysis.report_tables import Cell, Table
 from analysis.tables import cell_value
@@ -26,6 +27,10 @@ class Repeat:
     spec_yaml: str
     """The resolved sweep file."""
     command: str
+    others: str
+    """From which trial on a launch of that file gives other trials, and why; empty: it gives all that it names."""
+    injected_yaml: str
+    """The points that `inject` added, which the file has not; empty: there are none."""
     reproduce: str
     """The command that runs one trial again and compares; empty: none has ended, or they are a population's."""
     hyperparams: Table
@@ -35,14 +40,46 @@ def section(source: Source) -> Repeat:
     """Return what the section shows."""
     import yaml
 
-    spec = yaml.safe_dump(source.sweep.spec, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    def as_yaml(data: object) -> str:
+        return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None))
+
+    injected = _injected(source.sweep)
     return Repeat(
         facts=[*facts(source.sweep), *_machines(source)],
-        spec_yaml=spec,
+        spec_yaml=as_yaml(source.sweep.spec),
         command=f"tune-jobs launch {shlex.quote(f'{source.sweep.name}.yaml')} --name {shlex.quote(_again(source))}",
+        others=_others(source),
+        injected_yaml=as_yaml([item.point for item in injected]) if injected else "",
         reproduce=_reproduce(source),
         hyperparams=hyperparam_table(source.sweep),
     )
+
+
+def _injected(sweep: SweepRecord) -> tuple[ChosenPointRecord, ...]:
+    given = sweep.spec.get("points")
+    # Those of the sweep file come first.
+    return sweep.chosen_points[len(given) if isinstance(given, list) else 0 :]
+
+
+def _others(source: Source) -> str:
+    """Return from which trial on the sweep file gives others than the sweep has.
+
+    A launch of the file draws all of its points first, and more seeds come last. Where a point was injected, or a
+    setting got a seed, before the sweep was extended, what came later has another number, and with it other seeds.
+    """
+    sweep = source.sweep
+    seeds = sweep.spec.get("seeds_per_point")
+    if type(seeds) is not int or seeds < 1:
+        return ""
+    first, why = [], []
+    if injected := _injected(sweep):
+        first.append(first_index(injected[0].num_points, seeds, sweep.replications))
+        why.append("points were injected")
+    num_points = 1 + max((trial.point_index for trial in source.trials), default=-1)
+    if sweep.replications and (before := sweep.replications[0].num_points) < num_points:
+        first.append(before * seeds)
+        why.append("the sweep was extended after settings had been given more seeds")
+    return f"From t{min(first):04d} on a launch gives other trials, as {' and '.join(why)}." if first else ""
 
 
 def facts(sweep: SweepRecord) -> list[tuple[str, str]]:

@@ -5,12 +5,12 @@
   if (!source) return;
   const { charts, trials, colors } = JSON.parse(source.textContent);
   const darkTheme = matchMedia("(prefers-color-scheme: dark)");
-  const PAPER_WIDTH = 660, NARROW = 560;
+  const PAPER_WIDTH = 660, NARROW = 560, MAX_LABELS = 12, NUM_COLORS = 6;
   let onPaper = false;
 
   const color = (name) => colors[darkTheme.matches && !onPaper ? "dark" : "light"]["--" + name];
   const ramp = () => [0, 1, 2, 3, 4].map((i) => color("ramp-" + i));
-  const category = (i) => color(i < 6 ? "series-" + i : "muted");
+  const category = (i) => color(i < NUM_COLORS ? "series-" + i : "muted");
   const known = (values) => values.filter((value) => value !== null);
   const rounded = (value, digits) => (Math.abs(value) >= 1e6 || (value && Math.abs(value) < 1e-3)
     ? value.toExponential(digits - 2).replace(/\.?0+e/, "e").replace("e+", "e") : String(+value.toPrecision(digits)));
@@ -55,7 +55,7 @@
     const label = (i) => (isRange && !vertical && !narrow ? axis.labels[i]?.replace(" to ", "\nto ") : axis.labels[i]) ?? "";
     return { ...option, min: -0.5, max: axis.labels.length - 0.5, splitLine: { show: false }, axisLabel: {
       ...option.axisLabel, customValues: places, formatter: label, width: narrow && !isRange ? 80 : 130,
-      overflow: "truncate", interval: 0, lineHeight: 13, hideOverlap: false,
+      overflow: "truncate", interval: 0, lineHeight: 13, hideOverlap: places.length > MAX_LABELS,
       rotate: !vertical && isRange && narrow ? 70 : !vertical && !isRange && axis.labels.join("").length > (narrow ? 24 : 60) ? 30 : 0,
     } };
   }
@@ -123,10 +123,14 @@
 
   function panelKeys() {
     const { axis, values } = trials.columns[0];
-    const keys = axis.kind === "category"
-      ? axis.labels.map((label, i) => ({ name: axis.name + " " + label, color: i < 6 ? "series-" + i : "muted" }))
-      : [{ name: axis.name, ramp: extent(values).map(short) }];
-    return [...keys, ...endingKeys()];
+    if (axis.kind !== "category") return [{ name: axis.name, ramp: extent(values).map(short) }, ...endingKeys()];
+    // Those beyond the colours look alike, so one key tells of them all.
+    const others = axis.labels.length - NUM_COLORS;
+    return [
+      ...axis.labels.slice(0, NUM_COLORS).map((label, i) => ({ name: axis.name + " " + label, color: "series-" + i })),
+      ...(others > 0 ? [{ name: exact(others) + " other value" + (others > 1 ? "s" : ""), color: "muted" }] : []),
+      ...endingKeys(),
+    ];
   }
 
   const halo = () => ({ textBorderColor: color("card"), textBorderWidth: 3 });
@@ -232,12 +236,18 @@
     };
   }
 
+  // The goal's line has a point that is not seen: axes reach to points, but not to marks.
+  const goalSeries = ({ goal, lines }) => (goal === undefined ? [] : [{
+    type: "line", data: [[known(lines.flatMap((line) => line.x))[0], goal]], symbol: "none", silent: true,
+    tooltip: { show: false }, markLine: goalLine(goal),
+  }]);
+
   const plots = (chart) => chart.plots.map((plot) => ({
     title: plot.title,
     option: (narrow) => frame(plot.x, plot.y, narrow || chart.plots.length > 1, {
       tooltip: { trigger: "axis", axisPointer: { lineStyle: { color: color("muted") } }, formatter: plotTip(plot) },
       series: plot.lines.filter((line) => !chart.hidden.has(line.name)).flatMap((line) => lineSeries(line, plot))
-        .concat(plot.goal === undefined ? [] : [{ type: "line", data: [], markLine: goalLine(plot.goal) }]),
+        .concat(goalSeries(plot)),
     }),
   }));
 

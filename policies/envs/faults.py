@@ -20,6 +20,7 @@ from gymnasium.error import DependencyNotInstalled
 
 from policies.envs.rendering import display_hint
 from policies.envs.requirements import module_of_file, unmet_requirements
+from policies.envs.working_folder import leave_removed_folder
 from policies.errors import EnvFailedError, said_by
 
 _PACKAGE = PurePath(__file__).parents[1]
@@ -257,3 +258,4 @@ def close_env(env: Any) -> None:
     except BaseException as error:
         if not is_of_env(error):
             raise
+    leave_removed_folder()

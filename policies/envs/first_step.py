@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from numpy.typing import NDArray
 
 from policies.envs.byte_images import as_bytes
@@ -44,6 +45,17 @@ class Largest(NamedTuple):
     """Where the environment itself has it: `observation['x'][0]`, or `[3]`."""
 
 
+class Carried(NamedTuple):
+    """What an episode leaves to the next one, beside what the first observation shows of it."""
+
+    step: str | None = None
+    """How the first step differs when seed and action are given again; None: it does not, or was not made again."""
+    scales_rewards: bool = False
+    """Whether a `NormalizeReward` of Gymnasium's is around the environment, and goes on counting."""
+    scales_observations: bool = False
+    """The same of a `NormalizeObservation`."""
+
+
 class FirstStep(NamedTuple):
     """What an environment showed when it was tried."""
 
@@ -52,10 +64,16 @@ class FirstStep(NamedTuple):
     unrepeated: str | None
     """How the first observation differs when the same seed is given again; None: it does not."""
     largest: Largest
+    carried: Carried
+
+
+class _Step(NamedTuple):
+    observation: NDArray[np.float64]
+    reward: float
 
 
 def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str, Any]) -> FirstStep:
-    """Reset an environment, step it once with some action, check what it returns, and reset it again.
+    """Reset an environment, step it once with some action, check what it returns, and do both again.
 
     Args:
         env: The environment.
@@ -77,12 +95,15 @@ def check_first_step(env: gym.Env[Any, Any], env_id: str, env_args: Mapping[str,
     first = np.array(observation, np.float64)  # the env may write the next one into it
     # As the env itself gets it, so that its author can repeat the call.
     own = space.own(action) if is_made(space) else action
-    _check_call(
-        env, "step", lambda: env.step(action),
+    returned = _check_call(
+        env, "step", lambda: env.step(copy.deepcopy(action)),  # the env may write into it
         find_problem=_step_problem, complaint=f"{name} cannot be stepped, with the action {own!r} after a reset",
         hint=_STEP_HINT,
     )  # fmt: skip
-    return FirstStep(dict(infos), _other_again(env, first), _largest(env.observation_space, first))
+    step = _as_step(returned)
+    unrepeated, other_step = _other_again(env, first, action, step)
+    carried = Carried(other_step, _counts(env, NormalizeReward), _counts(env, NormalizeObservation))
+    return FirstStep(dict(infos), unrepeated, _largest(env.observation_space, first), carried)
 
 
 def _largest(space: gym.Space[Any], observation: NDArray[np.float64]) -> Largest:
@@ -91,20 +112,58 @@ def _largest(space: gym.Space[Any], observation: NDArray[np.float64]) -> Largest
     return Largest(float(values[number]), _place_in(space, number))
 
 
-def _other_again(env: gym.Env[Any, Any], first: NDArray[np.float64]) -> str | None:
-    """Reset an environment with the first seed once more, and say where its observation is another one."""
+def _counts(env: gym.Env[Any, Any], kind: type[gym.Wrapper[Any, Any, Any, Any]]) -> bool:
+    """Whether a wrapper of this kind is around an environment, and changes what it does by what it sees."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, kind) and getattr(env, "update_running_mean", True):
+            return True
+        env = env.env
+    return False
+
+
+def _other_again(
+    env: gym.Env[Any, Any], first: NDArray[np.float64], action: Any, step: _Step
+) -> tuple[str | None, str | None]:
+    """Reset an environment with the first seed once more, and step it with the first action.
+
+    Returns:
+        Where the first observation is another one; and if it is the same, how the step is another one.
+    """
+    space = env.observation_space
+    mask = slice(num_masked(space))
     try:
-        again = np.asarray(env.reset(seed=0)[0], np.float64)
+        again = np.array(env.reset(seed=0)[0], np.float64)
+        unrepeated = _difference(space, first, again)
+        # Where the mask is another one, the action may not be allowed.
+        if unrepeated is not None or not np.array_equal(first.flat[mask], again.flat[mask]):
+            return unrepeated, None
+        other = _as_step(env.step(action))
     except Exception:  # noqa: BLE001 (whatever it is, that it can be reset only once is told by the trials)
-        return None
+        return None, None
+    if not _is_close(step.reward, other.reward):
+        return None, f"its reward is {step.reward:g} and then {other.reward:g}"
+    place = _difference(space, step.observation, other.observation)
+    return None, None if place is None else f"of its observation {place}"
+
+
+def _as_step(returned: Any) -> _Step:
+    """Return what a step gave, as it stays whatever the env does with its own arrays."""
+    return _Step(np.array(returned[0], np.float64), reward_as_number(returned[1]))
+
+
+def _difference(space: gym.Space[Any], first: NDArray[np.float64], again: NDArray[np.float64]) -> str | None:
+    """Say where an observation is another one than it was; masks don't count."""
     if again.shape != first.shape:
         return f"it is of shape {first.shape} and then {again.shape}"
-    # What is computed in another order differs by less.
-    differs = np.flatnonzero(~np.isclose(first, again, rtol=1e-3, atol=1e-5, equal_nan=True))
-    for number in map(int, differs[differs >= num_masked(env.observation_space)][:1]):
-        values = f"{first.flat[number]:g} and then {again.flat[number]:g}"
-        return f"{_place_in(env.observation_space, number)} is {values}"
+    differs = np.flatnonzero(~_is_close(first, again))
+    for number in map(int, differs[differs >= num_masked(space)][:1]):
+        return f"{_place_in(space, number)} is {first.flat[number]:g} and then {again.flat[number]:g}"
     return None
+
+
+def _is_close(first: Any, again: Any) -> Any:
+    # What is computed in another order differs by less.
+    return np.isclose(first, again, rtol=1e-3, atol=1e-5, equal_nan=True)
 
 
 def _check_call(

@@ -24,10 +24,11 @@ from policies.envs.calls import Call
 from policies.envs.checked import PlainSteps
 from policies.envs.failures import FailureRule, check_failure_penalty, failure_rule
 from policies.envs.faults import close_env, hint_on, is_of_env, place_in_env
-from policies.envs.first_step import Largest, check_first_step
+from policies.envs.first_step import Carried, Largest, check_first_step
 from policies.envs.flat import FlatBox, FlatObservations, UnsupportedMemberError, flattened, needs_flattening
 from policies.envs.ids import as_creator, find_env, normalize_env_id
 from policies.envs.images import SeenImage, image_seen
+from policies.envs.loops import make_loop
 from policies.envs.mask_hints import UnusedMask, unused_mask
 from policies.envs.masks import MasksActions, may_be_masked, seen_by_networks
 from policies.envs.mujoco_warnings import say_each_once
@@ -38,7 +39,7 @@ from policies.envs.rendering import choose_before_import, draw_without_display, 
 from policies.envs.signatures import named_parameters, takes_any_name
 from policies.envs.space_hints import action_hint, observation_hint, one_choice_hint
 from policies.envs.spaces import unwritable_key
-from policies.envs.time_limits import time_limit_of
+from policies.envs.time_limits import check_limit, time_limit_of
 from policies.envs.wrappers import PIXELS, FailurePenalty, ObservationWrappers, constructor_args, wrapper_of
 from policies.errors import EnvError, said_by
 from policies.suggestions import did_you_mean
@@ -50,6 +51,7 @@ __all__ = [
     "ALLOWED_MODULES",
     "ATARI_TRAINING",
     "FAILURE_PENALTY",
+    "MODULE_FOLDERS",
     "EnvInfo",
     "check_env",
     "make_env",
@@ -59,11 +61,12 @@ __all__ = [
 
 # These stand in an env runner's `env_config` beside the env's arguments, never among them.
 FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES = "failure_penalty", "atari_training", "allowed_modules"
+MODULE_FOLDERS = "module_folders"
 # Keyword arguments of gym.make and gym.make_vec that are set here and not by a sweep file, and the keys of env runners
 # from above.
 _RESERVED_ARGS = frozenset({
     "id", "render_mode", "disable_env_checker", "num_envs", "vectorization_mode", "vector_kwargs", "wrappers",
-    FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES,
+    FAILURE_PENALTY, ATARI_TRAINING, ALLOWED_MODULES, MODULE_FOLDERS,
 })  # fmt: skip
 _RGB_ARRAY = "rgb_array"
 _LIMIT = "max_episode_steps"
@@ -96,6 +99,8 @@ class EnvInfo:
     """How its first observation differs when the same seed is given again; None: it does not."""
     largest: Largest | None = None
     """The number farthest from 0 in its first observation; None: it was not looked at."""
+    carried: Carried = field(default_factory=Carried)
+    """What an episode leaves to the next one, beside what `unrepeated` says."""
 
     @property
     def observes_images(self) -> bool:
@@ -147,7 +152,9 @@ def check_env(env_id: str, env_args: Mapping[str, Any] | None, algorithm: Algori
         _check_keys(info)
         tried = check_first_step(env, info.env_id, constructor_args(info.env_args))
         unused = None if mask is not None or wrappers.action_mask is not None else unused_mask(env, tried.infos)
-        return replace(info, unused_mask=unused, unrepeated=tried.unrepeated, largest=tried.largest)
+        return replace(
+            info, unused_mask=unused, unrepeated=tried.unrepeated, largest=tried.largest, carried=tried.carried
+        )
     finally:
         close_env(env)
 
@@ -218,8 +225,8 @@ def make_vector_env(
                     kwargs["render_mode"] = _prepare_pixels(env_id, spec)
                 given = {**spec.kwargs, **kwargs}
                 around = lambda game: wrappers.wrap_images(game, given), wrappers.wrap_mask, flattened, PlainSteps
-                make_all = partial(gym.make_vec, vectorization_mode="sync", disable_env_checker=True, wrappers=around)
-                env = _made(partial(make_all, num_envs=num_envs), env_id, spec, kwargs, wrappers)
+                make_all = partial(make_loop, num_envs=num_envs, wrappers=around)
+                env = _made(make_all, env_id, spec, kwargs, wrappers)
         env = calls.watch_env(wrappers.wrap_vector(env))
     except BaseException as error:  # an env's constructor may raise anything
         raise _cannot_make(env_id, env_args, error) from error
@@ -321,15 +328,7 @@ def _check_args(env_id: str, spec: EnvSpec, env_args: dict[str, Any]) -> None:
                 f"It takes: {', '.join(sorted(known))}.",
             )
     if _LIMIT in env_args:
-        _check_limit(env_id, env_args[_LIMIT])
-
-
-def _check_limit(env_id: str, limit: Any) -> None:
-    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
-        raise EnvError(
-            f"The env argument 'max_episode_steps' of {env_id} is {limit!r}; it must be a whole number >= 1.",
-            "Correct it, or leave it out to keep the env's own limit.",
-        )
+        check_limit(env_id, env_args[_LIMIT])
 
 
 def _cannot_make(env_id: str, env_args: Mapping[str, Any] | None, error: BaseException) -> EnvError:

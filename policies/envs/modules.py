@@ -30,6 +30,7 @@ ENVIRONMENT_VARIABLE = "TUNE_JOBS_ALLOWED_MODULES"
 _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 # Names of packages of this project that a user's own packages may have too; see tune_jobs/process/own_packages.py.
 _SHARED = ("policies", "analysis")
+_FINDER = ".__path_hook__"
 
 _allowed: set[str] = set()
 _allowed_in_block: ContextVar[set[str] | None] = ContextVar("allowed_in_block", default=None)
@@ -86,6 +87,11 @@ def module_folders() -> list[str]:
     Modules that this process has not imported are looked for, but not imported.
     """
     found = []
+    on_path = {os.path.abspath(entry) for entry in sys.path}  # noqa: PTH100 (sys.path holds strings)
+    # When a module was imported by such an entry, as by a notebook's "", the working directory may have been another.
+    # What setuptools puts there for editable installations is the name of a finder, of no folder.
+    folders = (entry for entry in sys.path if not str(entry).endswith(_FINDER))
+    has_relative = any(not os.path.isabs(entry) for entry in folders)  # noqa: PTH117
     for name in allowed_modules():
         file, depth = _file_of(name)
         if file is None:
@@ -94,9 +100,17 @@ def module_folders() -> list[str]:
         # The __file__ of a package is its __init__.py.
         place = path.parent if path.name == "__init__.py" else path
         folder = str(place.parents[depth])
-        if folder in {os.path.abspath(entry) for entry in sys.path}:  # noqa: PTH100 (sys.path holds strings)
+        if has_relative or folder in on_path:
             found.append(folder)
     return list(dict.fromkeys(found))
+
+
+def look_in(folders: Iterable[str]) -> None:
+    """Let modules be found in another process's `module_folders` too, after all other places.
+
+    Folders that are not there, as on another machine, are left out.
+    """
+    sys.path += [folder for folder in folders if folder not in sys.path and os.path.isdir(folder)]  # noqa: PTH112
 
 
 def _file_of(name: str) -> tuple[str | None, int]:
@@ -203,14 +217,31 @@ def path_of(thing: type[Any], what: str) -> str:
         what: The role of the class, for messages.
 
     Raises:
-        SpecError: It is defined in a script, a notebook or a function, where no other process finds it.
+        SpecError: It is defined in a script, a notebook or a function, where no other process finds it; or the module
+            has another class by its name.
     """
     module, name = thing.__module__, thing.__qualname__
-    if module == "__main__" or getattr(sys.modules.get(module), name, None) is not thing:
+    found = getattr(sys.modules.get(module), name, None)
+    is_found = isinstance(found, type) and (found.__module__, found.__qualname__) == (module, name)
+    if module == "__main__" or not is_found:
         where = "the main script" if module == "__main__" else f"a function or class of {module}"
         raise SpecError(
             f"The {what} {name} is defined in {where}, where the processes of trials cannot find it.",
             "Move it to the top level of a module, such as my_envs.py next to the script, and import it from there.",
         )
+    if found is not thing and not _is_written(thing):
+        raise SpecError(
+            f"The {what} {name} is not the class that {module}.{name} is now, which the processes of trials import.",
+            f"If {module} was imported again since, take the class from there anew. A class that a function makes "
+            f"needs a name of its own at the top level of {module}.",
+        )
     allow_modules([module])
     return f"{module}:{name}"
+
+
+def _is_written(thing: type[Any]) -> bool:
+    """Whether a class was made by a class statement, as before a reload, and not by a call of `type`.
+
+    By such calls, a function gives one name to many classes. They add the name of the module last, a statement first.
+    """
+    return next(iter(vars(thing)), None) == "__module__"

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, NoReturn
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
+from policies.answers import wait_for_answer
 from policies.child_processes import BEGINNING, how_it_ended
 from policies.envs.faults import Frame, note_signals, place_in_env, set_place
 from policies.envs.modules import allow_modules, allowed_modules
@@ -31,6 +32,7 @@ from policies.envs.rendering import choose_before_import, draw_without_display
 from policies.envs.signatures import needs_nothing
 from policies.errors import said_by
 from policies.parents import end_with_parent
+from policies.standard_streams import for_child
 
 OWN_PROCESS = "own_process"
 """The reserved key among an environment's arguments that asks for it."""
@@ -98,6 +100,8 @@ class InOwnProcess(gym.Env[Any, Any]):
                 [sys.executable, "-P", "-c", code],
                 env={_THREADS: "1", **os.environ},
                 stdin=subprocess.DEVNULL,
+                stdout=for_child("stdout"),
+                stderr=for_child("stderr"),
                 pass_fds=[theirs.fileno()],
             )
         self._end = weakref.finalize(self, _end, self._connection, self._process)
@@ -147,6 +151,7 @@ class InOwnProcess(gym.Env[Any, Any]):
         data = pickle.dumps(asked)
         try:
             self._connection.send_bytes(data)
+            wait_for_answer(self._connection, lambda: self._process.poll() is not None)
             data = self._connection.recv_bytes()
         except (EOFError, OSError) as error:
             raise RuntimeError(f"its own process {self._how_it_ended()}") from error

@@ -7,8 +7,23 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.wrappers import AtariPreprocessing, TimeLimit
 
+from policies.errors import EnvError
+
 _PASS_ON = ("gymnasium", "policies")
 """Whose steps are one step of the environment inside each, and end an episode where it does, at least."""
+
+
+def check_limit(env_id: str, limit: Any) -> None:
+    """Refuse an env argument `max_episode_steps` that is no limit.
+
+    Raises:
+        EnvError: It is none.
+    """
+    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+        raise EnvError(
+            f"The env argument 'max_episode_steps' of {env_id} is {limit!r}; it must be a whole number >= 1.",
+            "Correct it, or leave it out to keep the env's own limit.",
+        )
 
 
 def time_limit_of(env: gym.Env[Any, Any]) -> int | None:

@@ -106,8 +106,8 @@ def _see(asked: Mapping[str, Any]) -> None:
     """Give this process the parent's log, folder, import path and allowed modules."""
     print_to(asked.get("log"))
     env_modules.allow_modules(asked["modules"])
-    if os.getcwd() != asked["folders"][0]:  # noqa: PTH109
-        os.chdir(asked["folders"][0])
+    # Without asking where it is: an env may have gone to a folder that it has removed since.
+    os.chdir(asked["folders"][0])
     missing = [folder for folder in (*asked["folders"], *asked["module_folders"]) if folder not in sys.path]
     sys.path[:0] = missing
     if ":" in asked["arguments"]["env_id"]:
@@ -145,6 +145,7 @@ def check_env(env_id: str, env_args: dict[str, Any], algorithm: Any) -> dict[str
         "is_flattened": info.is_flattened,
         "unrepeated": info.unrepeated,
         "largest": info.largest,
+        "carried": info.carried,
     }
 
 

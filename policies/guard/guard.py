@@ -34,7 +34,7 @@ from policies.errors import CannotRunError, EnvFailedError, TuneJobsError
 from policies.files import absolute
 from policies.guard.failures import died, frames_in, hung, place_of
 from policies.guard.shared_files import shared_files
-from policies.standard_streams import standard_streams
+from policies.standard_streams import for_child, standard_streams
 
 CALL_TIMEOUT_S = 600.0
 """How long one call may take, unless a sweep sets it."""
@@ -68,7 +68,9 @@ class _Surroundings:
     @classmethod
     def now(cls) -> _Surroundings:
         folders = [str(absolute(Path()))]
-        script = os.path.dirname(os.path.realpath(sys.argv[0]))  # noqa: PTH120 (the same way as Ray)
+        # An embedded Python has no arguments.
+        name = sys.argv[0] if sys.argv else ""
+        script = os.path.dirname(os.path.realpath(name))  # noqa: PTH120 (the same way as Ray)
         if hasattr(sys.modules.get("__main__"), "__file__") and script in sys.path:
             folders.append(script)
         return cls(tuple(folders), tuple(map(os.environ.get, _VARIABLES)))
@@ -102,6 +104,8 @@ class _Child:
                 # the cores have other work, a policy took 60 times as long for an image of Atari's.
                 env={_THREADS: "1", **os.environ},
                 stdin=subprocess.DEVNULL,
+                stdout=for_child("stdout"),
+                stderr=for_child("stderr"),
                 pass_fds=numbers,
                 # Ctrl-C in a terminal reaches only the parent, which then ends the child.
                 start_new_session=True,

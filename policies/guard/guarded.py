@@ -20,7 +20,7 @@ from policies.acting.baselines import ConstantPolicy, baseline_policy
 from policies.acting.evaluate import Episodes
 from policies.acting.policy import Policy, RandomPolicy, WeightsPolicy
 from policies.envs.failures import FailureRule
-from policies.envs.first_step import Largest
+from policies.envs.first_step import Carried, Largest
 from policies.envs.make import EnvInfo
 from policies.envs.mask_hints import UnusedMask
 from policies.envs.spaces import space_from_description
@@ -95,6 +95,7 @@ def check_env(
     told |= {"env_args": args, "failure": None if failure is None else FailureRule(**failure)}
     told["unused_mask"] = None if told["unused_mask"] is None else UnusedMask(*told["unused_mask"])
     told["largest"] = None if told["largest"] is None else Largest(*told["largest"])
+    told["carried"] = Carried(*told["carried"])
     return EnvInfo(**told)
 
 

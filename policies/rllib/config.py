@@ -13,8 +13,8 @@ from typing import Any
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.algorithms.ppo import PPOConfig
 
-from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY
-from policies.envs.modules import allowed_modules
+from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY, MODULE_FOLDERS
+from policies.envs.modules import allowed_modules, module_folders
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.networks.rl_modules import module_spec
 from policies.rllib.dqn_algorithm import ReplayDQNConfig
@@ -56,8 +56,8 @@ def build_algorithm_config(
     if atari_training is not None:
         env_config[ATARI_TRAINING] = atari_training
     if modules := allowed_modules():
-        # Env runners in processes of their own do not have the allowed modules yet.
-        env_config[ALLOWED_MODULES] = modules
+        # Env runners in processes of their own do not have the allowed modules yet, nor their places in a user's Ray.
+        env_config[ALLOWED_MODULES], env_config[MODULE_FOLDERS] = modules, module_folders()
     return (
         config.environment(env_id, env_config=env_config, disable_env_checking=True)
         .env_runners(

@@ -27,8 +27,8 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from policies.envs.action_bounds import ToBounds
 from policies.envs.checked import CheckedEnvs
-from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY, make_vector_env
-from policies.envs.modules import allow_modules
+from policies.envs.make import ALLOWED_MODULES, ATARI_TRAINING, FAILURE_PENALTY, MODULE_FOLDERS, make_vector_env
+from policies.envs.modules import allow_modules, look_in
 from policies.envs.spaces import observation_dtype
 from policies.envs.training_view import TrainingView
 from policies.networks.own_modules import check_stateless
@@ -115,6 +115,7 @@ class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
         if isinstance(self.config.env_config, EnvContext):
             env_args = dict(self.config.env_config.items())
         # The settings that build_algorithm_config adds beside the env's arguments.
+        look_in(env_args.pop(MODULE_FOLDERS, ()))
         allow_modules(env_args.pop(ALLOWED_MODULES, ()))
         penalty, atari_training = env_args.pop(FAILURE_PENALTY, None), env_args.pop(ATARI_TRAINING, None)
         num_envs = self.config.num_envs_per_env_runner
@@ -310,12 +311,12 @@ class ArrayEnvRunner(TellsErrors, SingleAgentEnvRunner):  # type: ignore[misc]
             out[Columns.ACTION_LOGP] = dist.logp(out[Columns.ACTIONS])
 
     def _for_env(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Return actions as the env takes them; the stored ones stay as the policy drew them."""
+        """Return actions as the env takes them, which it may write into; the stored ones stay as they were drawn."""
         if self._to_bounds is None:
             space = self.env.single_action_space
             # The network's outputs count from 0; RLlib itself ignores that a space may start elsewhere.
             start = space.start if isinstance(space, gym.spaces.Discrete) else 0
-            return actions + start if start else actions
+            return actions + start
         return self._to_bounds(actions)
 
     def _try_env_step(self, actions: Any) -> Any:

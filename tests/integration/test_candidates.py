@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from sweep_folders import make_sweep_folder
 
-from analysis.records import CheckpointRecord
+from analysis.records import CheckpointRecord, TrialStatus
 from analysis.selection import NoUsableTrialError
 from policies.errors import CheckpointError
 from policies.portable.file import read_policy
 from tests.narrowing import present
-from tune_jobs.store.candidates import read_trials
+from tune_jobs.store.candidates import read_results, read_trials
 from tune_jobs.store.record_files import seal
 from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
@@ -118,6 +118,39 @@ def test_results_that_cannot_be_read_contradict_nothing(
 ) -> None:
     damage(store.trial("t0003").results_path)
     assert chosen(store) == ("t0003", 6, 36.0)
+
+
+@pytest.mark.parametrize("empty", [False, True])
+def test_results_that_are_gone_are_told(store: SweepStore, caplog: pytest.LogCaptureFixture, *, empty: bool) -> None:
+    assert all(read_results(store).values())
+    assert warnings_of(caplog) == []
+    lost = store.trial("t0002").results_path
+    lost.write_bytes(b"") if empty else lost.unlink()
+    assert [trial_id for trial_id, results in read_results(store).items() if not results] == ["t0002"]
+    (warning,) = warnings_of(caplog)
+    assert f"results of trial t0002 in {store.place}, which has trained for 6 iterations, are gone" in warning
+
+
+@pytest.mark.parametrize("status", ["failed", "running"])
+def test_results_that_need_not_be_written_are_not_gone(
+    store: SweepStore, caplog: pytest.LogCaptureFixture, status: TrialStatus
+) -> None:
+    """Of a trial that was killed before it wrote any, and of one in an object store, which sends them later."""
+    store.trial("t0002").results_path.unlink()
+    trial = store.trial("t0002").read_record()
+    store.trial("t0002").write_record(trial.model_copy(update={"status": status}))
+    assert not read_results(store)["t0002"]
+    assert warnings_of(caplog) == []
+
+
+def test_a_trial_that_has_not_trained_has_no_results_to_lose(
+    store: SweepStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    store.trial("t0002").results_path.unlink()
+    trial = store.trial("t0002").read_record()
+    store.trial("t0002").write_record(trial.model_copy(update={"num_iterations": 0}))
+    assert not read_results(store)["t0002"]
+    assert warnings_of(caplog) == []
 
 
 def test_a_winner_whose_files_are_damaged_gives_way_to_the_next(

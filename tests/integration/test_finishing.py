@@ -287,3 +287,16 @@ def test_each_command_shows_how_far_it_is(
     # Without how far each is.
     words = [re.split("[:,]", text)[0] for text in shown]
     assert [word for number, word in enumerate(words) if words[number - 1 : number] != [word]] == said
+
+
+def test_what_a_library_raises_as_it_draws_is_a_note_beside_the_result(
+    sweep_of: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def draw(*_: Any) -> Path:
+        raise RuntimeError("no font was found.")
+
+    monkeypatch.setattr(finish, "make_report", draw)
+    result = finished(sweep_of(how="exit"))
+    assert result.notes[-1] == "No report: RuntimeError: no font was found."
+    assert result.exit_code == 3
+    assert "in draw" in caplog.text

@@ -7,6 +7,7 @@ import pytest
 from policy_factory import register_test_envs
 from test_packed_envs import own_modules
 
+from policies.envs.first_step import Carried
 from policies.envs.make import check_env
 from policies.errors import EnvError
 from policies.guard import guarded
@@ -94,6 +95,15 @@ def test_the_guard_tells_of_what_cannot_be_seeded_too() -> None:
     assert re.fullmatch(
         r"\[0\] is -?[\d.]+ and then -?[\d.]+", present(guarded.check_env("odd_envs:Unseedable", None).unrepeated)
     )
+
+
+def test_the_guard_tells_what_an_episode_leaves_to_the_next() -> None:
+    assert guarded.check_env("odd_envs:Accumulates", None).carried == Carried("its reward is 1 and then 2")
+    # In a process of its own, where no wrapper is seen, what it does is.
+    alone = guarded.check_env("odd_envs:Scaled", {"own_process": True})
+    assert re.fullmatch(r"its reward is -?[\d.]+ and then -?[\d.]+", present(alone.carried.step))
+    assert not alone.carried.scales_rewards
+    assert guarded.check_env("odd_envs:Scaled", None).carried.scales_rewards
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Taxi-v3", "policy_factory:Walk"])

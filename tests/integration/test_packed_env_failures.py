@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -102,6 +103,24 @@ def test_a_process_that_is_killed_fails_its_members(make: Callable[..., PackedEn
     envs.remove("a")
     envs.add("b", 2)  # another process takes its place
     assert go_on(envs).rewards.all()
+
+
+def test_what_an_env_has_forked_does_not_hide_that_its_process_has_ended(make: Callable[..., PackedEnvs]) -> None:
+    envs = make("odd_envs:Helped", "processes", num_envs=2, members={"a": 1}, num_processes=2)
+    go_on(envs)
+    assert envs.errors == {}
+    before = time.monotonic()
+    envs.step(np.array([0, EXIT]))
+    assert "ended with exit code 7" in str(envs.errors["a"])
+    envs.remove("a")
+    assert time.monotonic() - before < 6
+
+
+def test_an_env_that_cannot_be_closed_has_its_failure_looked_up(make: Callable[..., PackedEnvs]) -> None:
+    envs = make("odd_envs:ClosesBadly", "scalar", members={"a": 1}, failure_penalty=-7.0)
+    for _ in range(7):
+        step = go_on(envs)
+    assert (step.rewards == -7).all()
 
 
 def test_a_process_that_is_dead_when_a_member_comes_fails_both(make: Callable[..., PackedEnvs]) -> None:

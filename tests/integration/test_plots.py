@@ -201,6 +201,15 @@ def test_few_or_negative_scores_still_draw(returns: list[float], goal: float | N
     assert to_png(figure, dpi=40).startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize(
+    ("returns", "goal"), [([0.0, 1e-3], None), ([0.0, 1e-3], 2e-3), ([-1e-3, -5e-4], None), ([3e-3, 3e-3], None)]
+)
+def test_small_scores_fill_their_plot(returns: list[float], goal: float | None) -> None:
+    low, high = score_per_episode(returns, goal=goal).axes[0].get_ylim()
+    shown = [0.0 if min(returns) > 0 else min(returns), max(*returns, goal or max(returns))]
+    assert high - low == pytest.approx(1.06 * (shown[1] - shown[0]))
+
+
 def test_no_episode_is_an_error() -> None:
     with pytest.raises(ValueError, match="at least one episode"):
         score_per_episode([], goal=1.0)

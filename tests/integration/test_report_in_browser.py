@@ -1,5 +1,6 @@
 """The report in a browser, driven as a reader would: sort, filter, brush, film; and nothing in its console."""
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from PIL import Image
 from synthetic_sweep import make_points, make_sweep
 
 from analysis.report import build_report
+from analysis.settings import judge_settings
 from policies.acting.movies import Mp4Writer
 from tests.narrowing import present
 
@@ -161,6 +163,60 @@ def test_whole_numbers_are_told_with_all_of_their_digits(browser: webdriver.Chro
     for index, (size, lr) in enumerate([("65,536", "0.001234"), ("1,000", "0.002"), ("12,345", "0.003")]):
         told = wait(browser, tip, plot, index).splitlines()
         assert {f"train_batch_size: {size}", f"lr: {lr}"} <= set(told)
+
+
+def test_a_goal_above_all_scores_is_in_every_chart_of_scores(browser: webdriver.Chrome, tmp_path: Path) -> None:
+    made = make_sweep(points=[{"lr": 1e-7}, {"lr": 2e-7}])
+    # So short that costs are drawn to a logarithmic scale.
+    made.results["t0000"] = made.results["t0000"][:1]
+    made.trials[0] = made.trials[0].model_copy(update={"num_env_steps": 1024, "num_iterations": 1})
+    spec = made.sweep.spec | {"objective": {"type": "final", "cost": "env_steps"}}
+    settings = judge_settings(made.trials, made.results, num_env_steps=50_000, threshold=195.0, cost="env_steps")
+    report = build_report(
+        str(tmp_path), target=tmp_path / "report", sweep=made.sweep.model_copy(update={"spec": spec}),
+        trials=made.trials, results=made.results, best=present(made.best).model_copy(update={"settings": settings}),
+        videos={},
+    )  # fmt: skip
+    browser.get(report.as_uri())
+    top = """
+        const chart = echarts.getInstanceByDom(arguments[0]);
+        return chart.getModel().getComponent("yAxis").axis.scale.getExtent()[1];
+    """
+    tip = """
+        const chart = echarts.getInstanceByDom(arguments[0]), { series } = chart.getOption();
+        const [x, y] = chart.convertToPixel("grid", series.at(-1).data[0]);
+        chart.dispatchAction({ type: "showTip", x, y });
+        return arguments[0].querySelector(".tip")?.innerText;
+    """
+    for name in ("curves_of_settings", "best_so_far", "score_against_cost"):
+        plot = drawn(browser, name)
+        assert wait(browser, top, plot) >= 195
+        assert "goal 195" in browser.execute_script("return arguments[0].textContent", plot)
+        # What keeps the goal within the axis is no value that a tooltip tells.
+        assert "195" not in wait(browser, tip, plot)
+    scale = "return echarts.getInstanceByDom(arguments[0]).getOption().xAxis[0].type"
+    assert browser.execute_script(scale, plot) == "log"
+
+
+def test_of_many_categories_those_with_colors_have_keys(browser: webdriver.Chrome, tmp_path: Path) -> None:
+    made = make_sweep(points=[{"activation": f"a{i:02d}", "lr": 1e-3} for i in range(30)], with_best=False)
+    report = build_report(
+        str(tmp_path), target=tmp_path / "report", sweep=made.sweep, trials=made.trials, results=made.results,
+        best=None, videos={},
+    )  # fmt: skip
+    browser.get(report.as_uri())
+    plot = drawn(browser, "hyperparameters")
+    keys = browser.find_elements(By.CSS_SELECTOR, "#chart-hyperparameters .keys li")
+    assert [key.text for key in keys] == [*(f"activation a{i:02d}" for i in range(6)), "24 other values"]
+    boxes = browser.execute_script(
+        """
+        return [...arguments[0].querySelectorAll("svg text")].filter((text) => /^a\\d\\d$/.test(text.textContent))
+          .map((text) => text.getBoundingClientRect()).map(({ left, right }) => [left, right]);
+        """,
+        plot,
+    )
+    assert 2 < len(boxes) <= 30
+    assert all(one[1] <= two[0] for one, two in itertools.pairwise(sorted(boxes)))
 
 
 @pytest.mark.parametrize("width", [400, 1280, 1920])

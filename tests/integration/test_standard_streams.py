@@ -46,6 +46,64 @@ def test_a_process_without_standard_streams_works_and_stays_without(tmp_path: Pa
     assert "by a library" in (tmp_path / "log.txt").read_text()
 
 
+# Started without standard error, so that its first file gets that number.
+WITHOUT_ERRORS = """
+from pathlib import Path
+mine = Path("mine.txt").open("w")
+assert mine.fileno() == 2
+
+from policies.guard import guard
+from policies.guard.guarded import check_env
+from tune_jobs.process.state import given_back
+from tune_jobs.process.streams import patient_stream, quiet, standard_error
+
+with patient_stream() as stream:
+    print("told by what follows the trials", file=stream)
+with given_back(), quiet(Path("log.txt")) as stream:
+    print("told by a sweep", file=stream)
+popen, started = guard.subprocess.Popen, []
+guard.subprocess.Popen = lambda *args, **kwargs: started.append(popen(*args, **kwargs)) or started[-1]
+with guard.guarding():
+    check_env("CartPole-v1", {})
+    place = Path(f"/proc/{started[0].pid}/fd/2").readlink()
+mine.write(f"{place} {standard_error()}")
+"""
+
+
+def test_what_is_told_and_what_children_print_goes_to_no_file_of_a_process_that_has_no_standard_error(
+    tmp_path: Path,
+) -> None:
+    subprocess.run(
+        [sys.executable, "-c", WITHOUT_ERRORS], check=True, cwd=tmp_path, preexec_fn=lambda: os.close(2),
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    assert (tmp_path / "mine.txt").read_text() == f"{os.devnull} {subprocess.DEVNULL}"
+
+
+WITH_A_PROCESS_FOR_ITS_ENV = """
+from pathlib import Path
+mine = Path("mine.txt").open("w")
+assert mine.fileno() == 2
+
+from policies.envs.make import make_env
+from policies.envs.modules import allow_modules
+
+allow_modules(["lone_envs"])
+env = make_env("lone_envs:Lone", {"own_process": True})
+mine.write(str(Path(f"/proc/{env.reset()[1]['pid']}/fd/2").readlink()))
+env.close()
+"""
+
+
+def test_what_an_environment_prints_in_its_own_process_goes_to_no_file_either(tmp_path: Path) -> None:
+    path = os.pathsep.join(map(str, (Path(__file__).parents[2], Path(__file__).parents[1] / "unit")))
+    subprocess.run(
+        [sys.executable, "-c", WITH_A_PROCESS_FOR_ITS_ENV], check=True, cwd=tmp_path, preexec_fn=lambda: os.close(2),
+        env=os.environ | {"PYTHONPATH": path},
+    )  # fmt: skip
+    assert (tmp_path / "mine.txt").read_text() == os.devnull
+
+
 @pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
 def test_commands_run_where_nobody_listens(tmp_path: Path, closed: tuple[int, ...]) -> None:
     def close_them() -> None:

@@ -1,11 +1,14 @@
 """The charts as figures: every kind is drawn, and its axes reach as far as its data."""
 
+import itertools
+
 import numpy as np
 import pytest
 from synthetic_sweep import make_sweep
 
 from analysis.charts import Chart, Subject, draw, make_charts
-from analysis.charts.model import Axis, Line, Plot, Plots
+from analysis.charts.columns import column
+from analysis.charts.model import Axis, Ending, Line, Panels, Plot, Plots, Trials
 from analysis.importance import what_mattered
 
 
@@ -34,6 +37,25 @@ def test_an_axis_that_begins_at_zero_reaches_as_far_as_the_data(charts: dict[str
     assert isinstance(data, Plots)
     assert low == 0
     assert high >= max(x for line in data.plots[0].lines for x in line.x if x is not None)
+
+
+@pytest.mark.parametrize(("num", "last"), [(6, "activation size 005"), (7, "1 other value"), (60, "54 other values")])
+def test_panels_of_many_categories_keep_their_room(num: int, last: str) -> None:
+    values = [f"size {i:03d}" for i in range(num)]
+    endings: tuple[Ending, ...] = tuple("whole" for _ in values)
+    trials = Trials(
+        tuple(map(str, range(num))), Axis("score"), tuple(map(float, range(num))), endings,
+        (column("activation", values, {}), column("lr", np.linspace(0.1, 0.2, num).tolist(), {})), tuple(range(num)),
+    )  # fmt: skip
+    figure = draw(Chart("hyperparameters", "mattered", "title", "caption", Panels(trials)))
+    # Where nothing fits, matplotlib warns and leaves the axes as they were.
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    keys = [text.get_text() for text in legend.get_texts()]
+    assert (len(keys), keys[-1]) == (min(num, 7), last)
+    assert all(axes.get_position().height * figure.get_figheight() > 1.0 for axes in figure.axes)
+    boxes = [label.get_window_extent() for label in figure.axes[0].get_xticklabels()]
+    assert all(one.x1 <= two.x0 for one, two in itertools.pairwise(boxes))
 
 
 def test_hollow_marks_are_trials_that_were_cut(charts: dict[str, Chart]) -> None:

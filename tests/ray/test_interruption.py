@@ -82,6 +82,7 @@ class Sweep:
         process = subprocess.Popen(
             [PROGRAM, *command, "--no-finish"],
             cwd=self.cwd,
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

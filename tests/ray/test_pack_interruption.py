@@ -52,8 +52,9 @@ def test_members_go_on_from_their_checkpoints_after_a_kill_and_an_interruption(
     command, latest = ["launch", "spec.yaml", "--name", "cut"], [0] * 4
     for number in (signal.SIGKILL, signal.SIGINT):
         process = subprocess.Popen(
-            [PROGRAM, *command, "--no-finish"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+            [PROGRAM, *command, "--no-finish"], cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
         try:
             wait_until(functools.partial(all_have_newer, folder, latest), process)
             process.send_signal(number)

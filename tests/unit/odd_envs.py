@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -281,3 +283,66 @@ class EndsFor(Fragile):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         return super().step(EXIT if self.is_bad and self.steps == 2 else 0)
+
+
+class Accumulates(Fragile):
+    """The reward of a step tells of all steps since it was made."""
+
+    action_space = gym.spaces.Discrete(1)
+    num_steps = 0
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.num_steps += 1
+        observation, _, *rest = super().step(action)
+        return observation, float(self.num_steps), *rest
+
+
+class Scaled(gym.Wrapper[Any, Any, Any, Any]):
+    """Rewards divided by what was seen of them before."""
+
+    def __init__(self) -> None:
+        super().__init__(gym.wrappers.NormalizeReward(Accumulates()))
+
+
+class Helped(Fragile):
+    """A process that it has forked helps it, and lives on for some seconds where its own ends."""
+
+    helper: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        if self.helper is None:
+            self.helper = multiprocessing.get_context("fork").Process(target=time.sleep, args=(12,), daemon=True)
+            self.helper.start()
+        return super().reset(seed=seed)
+
+    def close(self) -> None:
+        if self.helper is not None:
+            self.helper.terminate()
+
+
+class Travels(Fragile):
+    """Works in a folder of its own, which it removes as it closes."""
+
+    action_space = gym.spaces.Discrete(1)
+
+    def __init__(self, fails: bool = False) -> None:
+        self.folder = tempfile.TemporaryDirectory()
+        os.chdir(self.folder.name)
+        if fails:
+            self.close()
+            raise RuntimeError("nothing to do here")
+
+    def close(self) -> None:
+        self.folder.cleanup()
+
+
+class ClosesBadly(Fragile):
+    """Closing it raises an error, once; it ends by failure."""
+
+    metadata = {"failure": "terminated", "render_modes": []}  # noqa: RUF012 (Gymnasium's)
+    is_closed = False
+
+    def close(self) -> None:
+        if not self.is_closed:
+            self.is_closed = True
+            raise RuntimeError("the window is gone")

@@ -231,6 +231,19 @@ def test_a_checked_function_keeps_its_signature_and_pythons_own_errors() -> None
         example(1, item=2)  # type: ignore[call-arg]
 
 
+def test_numbers_that_are_too_small_are_no_errors_where_the_caller_wants_them_to_be() -> None:
+    @checked
+    def tiny() -> float:
+        return float(np.exp(np.float64(-1_000)))
+
+    with np.errstate(all="raise"):
+        before = np.geterr()
+        with pytest.raises(FloatingPointError):
+            inspect.unwrap(tiny)()
+        assert tiny() == 0.0
+        assert np.geterr() == before
+
+
 def test_numpys_numbers_are_taken_by_the_api(tmp_path: Path) -> None:
     with pytest.raises(TuneJobsError, match="No sweep"):
         tune_jobs.extend("x", np.int64(3), finish=np.bool_(False))  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from synthetic_sweep import Synthetic, make_sweep
 
 from analysis.charts import Chart, Subject, make_charts, to_json
 from analysis.charts.columns import MAX_SHOWN, column
-from analysis.charts.model import HeatMap, Panels, Parallel, Plots, Timeline, Trials
+from analysis.charts.model import Axis, HeatMap, Line, Panels, Parallel, Plot, Plots, Timeline, Trials
 from analysis.charts.population import schedule
 from analysis.importance import what_mattered
 from analysis.records import ChangeRecord, TrialRecord
@@ -99,6 +99,17 @@ def test_trials_that_were_cut_or_failed_are_marked_wherever_they_are(made: Synth
     hollow = [line for line in plots_of(charts["curves_of_settings"]).plots[0].lines if line.look == "hollow"]
     assert len(hollow) == 1
     assert "Settings with trials that did not train to the end are left out." in charts["performance_profile"].notes
+
+
+def test_trials_that_were_cut_are_marked_where_all_are_of_leading_settings() -> None:
+    made = make_sweep(points=POINTS[:3])
+    for index in (1, 2):
+        changed(made, index, status="stopped")
+    lines = plots_of(charts_of(made)["curves_of_settings"]).plots[0].lines
+    (hollow,) = [line for line in lines if line.look == "hollow"]
+    ends = [made.results[trial_id][-1] for trial_id in ("t0001", "t0002")]
+    assert hollow.x == tuple(item.num_env_steps for item in ends)
+    assert "other trials" not in [line.name for line in lines]
 
 
 def test_a_band_is_the_range_of_the_seeds_where_all_of_them_have_values(made: Synthetic) -> None:
@@ -232,6 +243,18 @@ def test_of_many_trials_the_best_and_an_even_choice_are_drawn_and_all_are_in_the
     best = sorted(range(700), key=lambda index: -(trials.scores[index] or 0.0))[:100]
     assert set(best) <= set(trials.shown)
     assert any("500 of 700 trials are drawn" in note for note in chart.notes)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1_234_567.0, "1234567"), (123_456_789_012.0, "123456789012"), (0.0, "0"), (1_000_000.25, "1000000.25"),
+        (0.1 + 0.2, "0.3"), (1e15, "1000000000000000.0"), (math.nan, "null"), (math.inf, "null"), (1e300, "1e+100"),
+    ],
+)  # fmt: skip
+def test_whole_numbers_keep_their_digits_in_the_data(value: float, text: str) -> None:
+    plot = Plot(Axis("x"), Axis("y"), (Line("line", "muted", (1,), (value,)),))
+    assert f'"y":[{text}]' in to_json([Chart("id", "cost", "title", "caption", Plots((plot,)))], COLORS)
 
 
 def test_the_data_can_stand_in_a_page_whatever_texts_they_hold() -> None:

@@ -1,5 +1,6 @@
 """The command line with --server where what it has begun can't be followed: it says what was begun, and where it is."""
 
+import errno
 import http.server
 import json
 import threading
@@ -17,6 +18,7 @@ from test_service_downloads import make_finished
 
 from tests.narrowing import present
 from tune_jobs.cli import remote_runs
+from tune_jobs.cli.server import Server
 from tune_jobs.client import Client
 from tune_jobs.client.asking import Asking
 from tune_jobs.client.problems import TooManyError
@@ -167,3 +169,19 @@ def test_why_a_sweep_has_no_best_policy_is_the_reason_that_its_job_gives(run: Ru
     assert (
         said == "Sweep mine has ended, and has no best policy.\nResume it: then one is chosen, or it is said why not."
     )
+
+
+def test_how_to_resume_is_said_though_nobody_reads_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C ends the reader of a pipe, too."""
+
+    def print_outcome(*_: Any, **__: Any) -> None:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr("tune_jobs.cli.output.print_outcome", print_outcome)
+    sweep = make_sweep_folder(tmp_path / "mine", iterations=1).read_record()
+    result = {"sweep": sweep, "trials": [], "best": None, "why_no_best": None, "folder": "", "artifacts": {}}
+    ended = {"notes": [], "interrupted": True, "exit_code": 130}
+    assert remote_runs._show(result | ended, Server("http://localhost:1", None, None, ""), as_json=False) == 130
+    assert "resume mine" in capsys.readouterr().err

@@ -64,6 +64,46 @@ def test_sweeps_of_one_name_are_two_sweeps() -> None:
     assert present(pair.difference).lower == pytest.approx(welch.low)
 
 
+def running(item: Wanted, **changes: Any) -> Wanted:
+    """The same, of a sweep whose last trial has not ended."""
+    trials = [*item.data.trials[:-1], item.data.trials[-1].model_copy(update={"status": "running"})]
+    sweep = item.sweep.model_copy(update={"state": "running"})
+    return dataclasses.replace(item, data=dataclasses.replace(item.data, trials=trials), sweep=sweep, **changes)
+
+
+def test_a_renamed_sweep_and_a_new_one_of_its_name_are_told_as_two() -> None:
+    """The record of a sweep whose folder was renamed has the name of before."""
+    old, new = wanted("a", LEFT), wanted("a", LEFT, created_at=1.0)
+    old = dataclasses.replace(old, name="a-old")
+    found = compare([old, new])
+    assert [entry.sweep for entry in found.entries] == ["a-old", "a"]
+    assert any("A and B have 5 trainings with the same" in note for note in found.notes)
+    told = [note for note in compare([running(old), running(new)]).notes if "have ended" in note]
+    assert [note.partition(" is running: 4 of 5 trials")[0] for note in told] == ["Sweep a-old", "Sweep a"]
+    # One whose seeds are not known to differ is replicated by the name that it has now.
+    single = dataclasses.replace(wanted("a", [1.0]), name="a-old")
+    assert "`tune-jobs replicate a-old`" in said(compare([single, new]))
+
+
+def test_sweeps_of_one_name_in_two_storages_are_told_as_two() -> None:
+    ours, theirs = wanted("a", LEFT), wanted("a", LEFT, created_at=1.0)
+    assert any("numbers twice" in note for note in compare([ours, theirs]).notes)
+    assert not any("numbers twice" in note for note in compare([ours, ours]).notes), "told where copies are read"
+    told = [note for note in compare([running(ours), running(theirs)]).notes if "have ended" in note]
+    assert len(told) == 2
+    settings = [running(wanted("a", LEFT, RIGHT, point_index=index)) for index in (0, 1)]
+    assert len([note for note in compare(settings).notes if "have ended" in note]) == 1
+
+
+def test_renamed_folders_are_compared_by_the_names_that_they_have(tmp_path: Path) -> None:
+    store = make_sweep_folder(tmp_path / "one")
+    store.folder.rename(tmp_path / "one-old")
+    again = make_sweep_folder(tmp_path / "one")
+    again.write_record(again.read_record().model_copy(update={"created_at": 1.0}))
+    found = tune_jobs.compare(["one-old", "one/t0002"], storage=tmp_path)
+    assert [entry.sweep for entry in found.entries] == ["one-old", "one"]
+
+
 def test_a_sweep_and_the_setting_that_leads_it_are_the_same_trainings() -> None:
     found = compare([wanted("a", RIGHT, LEFT), wanted("a", RIGHT, LEFT, point_index=1)])
     pair = the_pair(found)
@@ -132,6 +172,23 @@ def test_settings_are_the_same_however_numbers_are_written(one: Any, other: Any,
     assert (text_of(one) == text_of(other)) == equal
     points = [{"gamma": 0.5, "x": one}, {"x": other, "gamma": 0.5}]
     assert (meaning_of(points[0]) == meaning_of(points[1])) == equal
+
+
+@pytest.mark.parametrize(("fixed", "num_common"), [(50_000, 2), (20_000, 0)])
+def test_a_length_of_training_that_one_sweep_searches_may_be_the_fixed_one_of_another(
+    fixed: int, num_common: int
+) -> None:
+    left, right = wanted("a", LEFT, RIGHT), wanted("b", RIGHT, LEFT)
+    left = dataclasses.replace(left, data=dataclasses.replace(left.data, num_env_steps=fixed))
+    trials = [
+        trial.model_copy(update={"point": {**trial.point, "stop.num_env_steps": 5e4}}) for trial in right.data.trials
+    ]
+    space = {**right.sweep.section("space"), "stop.num_env_steps": {"grid": [25_000, 50_000]}}
+    sweep = right.sweep.model_copy(update={"spec": {**right.sweep.spec, "space": space}})
+    right = dataclasses.replace(right, data=dataclasses.replace(right.data, trials=trials), sweep=sweep)
+    for pair in ([left, right], [right, left]):
+        shared = the_pair(compare(pair)).shared
+        assert (0 if shared is None else shared.num_settings) == num_common
 
 
 # -- the settings of one sweep, by what they are judged by

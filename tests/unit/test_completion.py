@@ -1,6 +1,9 @@
 """What a shell completes: presets, sweep files, sweeps and trials, in the storage folder that stands before them."""
 
+import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -130,6 +133,54 @@ def test_a_service_that_does_not_answer_at_once_is_not_waited_for(
     assert names("status ") == []
     assert caplog.records == []
     assert capfd.readouterr() == ("", "")
+
+
+class Away:
+    """A storage that does not answer, as an object store that is tried again and again; and a sweep of it."""
+
+    def sweep(self, _: str) -> "Away":
+        return self
+
+    def wait(self) -> list[str]:
+        time.sleep(10)
+        return []
+
+    sweeps = exists = read_trials = read_record = wait
+
+
+def test_a_storage_that_does_not_answer_at_once_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(completion, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr("tune_jobs.store.opening.open_storage", lambda _: Away())
+    monkeypatch.setenv("TUNE_JOBS_STORAGE", "s3://bucket/sweeps")
+    began = time.monotonic()
+    assert names("status ") == names("export mine/t0") == names("inject mine l") == []
+    assert names("evaluate ") == ["random", "constant"]
+    assert time.monotonic() - began < 8
+
+
+# As a shell calls the script, with an object store whose listing comes and whose other answers don't.
+HANGS = """
+import time
+import tune_jobs.store.opening
+from tune_jobs.cli.__main__ import main
+from tune_jobs.store.objects.at_once import side_by_side
+
+class Hangs:
+    def sweeps(self):
+        return side_by_side(lambda name: time.sleep(120) or name, ["mine", "other", "third"])
+
+tune_jobs.store.opening.open_storage = lambda _: Hangs()
+main()
+"""
+
+
+def test_requests_that_are_on_their_way_are_not_waited_for_at_the_end(here: Path) -> None:
+    words = {"_TUNE_JOBS_COMPLETE": "bash_complete", "COMP_WORDS": "tune-jobs\nevaluate\n", "COMP_CWORD": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", HANGS], env={**os.environ, "TUNE_JOBS_STORAGE": "s3://bucket/sweeps", **words},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False, cwd=here,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "file,\nplain,random\nplain,constant\n", "")
 
 
 def test_words_that_bash_has_taken_apart_are_put_together(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from tune_jobs.sweeps.attach import attach
 from tune_jobs.sweeps.current_best import has_current_best
 from tune_jobs.sweeps.finishing import finish_sweep
 from tune_jobs.sweeps.outcome import SweepResult
+from tune_jobs.sweeps.policy_choice import confirmed_best
 from tune_jobs.sweeps.side_by_side import side_by_side
 from tune_jobs.sweeps.sweep_file import sweep_file
 
@@ -118,3 +119,55 @@ def test_a_file_and_a_comparison_have_no_outdated_winner(extended: SweepStore, t
     sweeps.best(extended.folder, num_episodes=2)
     assert json.loads(gzip.decompress(sweep_file(extended)))["best"] is not None
     assert "policy to deploy" in {fact.title for fact in side_by_side([extended, other]).facts}
+
+
+# -- checkpoints that were deleted to save space, with best/ kept
+
+
+def delete_checkpoints(store: SweepStore, *trial_ids: str) -> None:
+    for trial_id in trial_ids:
+        shutil.rmtree(store.trial(trial_id).folder / "checkpoints")
+
+
+def finished(store: SweepStore) -> SweepResult:
+    """What `resume` comes to where nothing is left to run."""
+    result = SweepResult(store.place, store.read_record(), store.read_trials())
+    return finish_sweep(store, result, keep=True)
+
+
+def test_a_best_policy_stays_where_no_checkpoint_is_left(store: SweepStore) -> None:
+    before, policy = store.read_best(), (store.best_folder / "policy.json").read_bytes()
+    delete_checkpoints(store, "t0000", "t0001", "t0002", "t0003")
+    assert has_current_best(store)
+    result = finished(store)
+    assert (result.best, result.why_no_best, result.finish_failed) == (before, None, False)
+    assert not any("of before" in note for note in result.notes)
+    assert (store.best_folder / "policy.json").read_bytes() == policy
+
+
+@pytest.mark.parametrize("extend", [False, True])
+def test_a_best_policy_whose_checkpoint_is_gone_is_not_replaced_without_a_word(
+    store: SweepStore, *, extend: bool
+) -> None:
+    before = store.read_best().checkpoint
+    delete_checkpoints(store, before.trial_id)
+    if extend:
+        extend_by_leaders(store)
+    result = finished(store)
+    assert present(result.best).checkpoint != before
+    (note,) = [note for note in result.notes if "of before" in note]
+    assert note.startswith("The best policy of before, t0003 at 600 env steps, could not compete")
+
+
+def test_a_best_policy_whose_checkpoint_its_own_trial_deleted_gives_way_as_ever(store: SweepStore) -> None:
+    winner = store.trial("t0003").read_record()
+    left = [item for item in winner.checkpoints if item != store.read_best().checkpoint]
+    delete_checkpoints(store, "t0000", "t0001", "t0002", "t0003")
+    store.trial("t0003").write_record(winner.model_copy(update={"checkpoints": tuple(left)}))
+    assert confirmed_best(store) is None
+
+
+def test_a_damaged_policy_stays_nowhere(store: SweepStore) -> None:
+    delete_checkpoints(store, "t0000", "t0001", "t0002", "t0003")
+    (store.best_folder / "policy.json").write_text("{")
+    assert confirmed_best(store) is None

@@ -1,5 +1,6 @@
 """A sweep that can't be made as a whole leaves no name taken, and one behind a symbolic link is left as it is."""
 
+import contextlib
 import errno
 import os
 import shutil
@@ -20,6 +21,7 @@ from tune_jobs.store.objects import bucket
 from tune_jobs.store.objects.bucket import StorageError
 from tune_jobs.store.patience import impatient
 from tune_jobs.store.sweep_store import SweepStore
+from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun
 
 # -- in a folder
 
@@ -129,6 +131,51 @@ def test_a_sweep_that_cannot_be_removed_as_what_is_left_of_another_is_in_the_way
     assert store.read_record() == make_sweep()
 
 
+# -- in a folder of NFS, which keeps what is removed for as long as it is open, under another name
+
+
+@pytest.fixture
+def on_nfs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have files that this process has open renamed where they are removed, as a client of NFS does."""
+    real = os.unlink
+
+    def unlink(path: str | Path, *, dir_fd: int | None = None) -> None:
+        found = os.stat(path, dir_fd=dir_fd, follow_symlinks=False)
+        for link in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(OSError):
+                if os.path.samestat(os.fstat(int(link.name)), found):
+                    kept = Path(path).with_name(f".nfs{found.st_ino:016x}")
+                    os.rename(path, kept, src_dir_fd=dir_fd, dst_dir_fd=dir_fd)
+                    return
+        real(path, dir_fd=dir_fd)
+
+    monkeypatch.setattr(os, "unlink", unlink)
+
+
+@pytest.mark.usefixtures("on_nfs")
+def test_a_sweep_is_removed_though_its_lock_is_open_meanwhile(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path / "mine")
+    store.create()
+    store.write_record(make_sweep())
+    store.delete()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("on_nfs")
+def test_what_is_discarded_under_its_lock_leaves_the_name_free(tmp_path: Path) -> None:
+    store, storage = SweepStore(tmp_path / "mine"), LocalStorage(tmp_path)
+    store.create()
+    with store.lock():
+        pass
+    free_half_made(storage, "mine")
+    assert list(tmp_path.iterdir()) == []
+    store.create()
+    store.write_record(make_sweep(state="created"))
+    with contextlib.suppress(RuntimeError), removed_if_not_begun(CreatedSweep("mine", store.place)):
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
 # -- in an object store
 
 
@@ -199,3 +246,14 @@ def test_what_is_more_than_a_new_sweep_is_left_alone(harness: Harness, sweep: Sw
     before = harness.keys("mine")
     free_half_made(harness.storage(), "mine")
     assert harness.keys("mine") == before
+
+
+def test_a_link_is_not_followed_where_a_name_is_freed(tmp_path: Path) -> None:
+    """What it leads to is elsewhere, and may be somebody's sweep."""
+    other = SweepStore(tmp_path / "elsewhere")
+    other.create()
+    other.record_path.write_text("{}")
+    (tmp_path / "mine").symlink_to(other.folder)
+    SweepStore(tmp_path / "mine").discard()
+    assert (tmp_path / "mine").is_symlink()
+    assert other.record_path.read_text() == "{}"

@@ -186,6 +186,7 @@ def test_who_checks_side_by_side_waits_for_one_answer(faults: Faults, opened: Op
 
 def test_a_report_is_uploaded_side_by_side_and_not_fetched_where_it_was_made(faults: Faults, opened: Opened) -> None:
     sweep = opened()
+    sweep.create()
     figures = ["figures/a.svg", "figures/b.svg", "figures/c.svg"]
     all_came = threading.Barrier(len(figures), timeout=30)
     faults.rule("slow", kinds="PUT", keys="/figures/", times=len(figures), then=all_came.wait)

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import lone_envs
 import numpy as np
+import odd_envs
 import pytest
 from policy_factory import make_policy
 
@@ -269,6 +270,16 @@ def test_one_that_ends_in_an_evaluation_fails_that_one_alone(tmp_path: Path) -> 
         assert "its own process ended with exit code 139" in failed.message
         expected = Episodes((1, 2), (3.0, 3.0), (3, 3))
         assert [*others, *evaluate_many(evaluator, [right])] == [expected] * 2
+
+
+def test_that_it_ends_is_noticed_though_what_it_has_forked_lives_on() -> None:
+    env = make_env("odd_envs:Helped", ALONE)
+    env.reset(seed=0)
+    before = time.monotonic()
+    with pytest.raises(RuntimeError, match="its own process ended with exit code 7"):
+        env.step(odd_envs.EXIT)
+    assert time.monotonic() - before < 6
+    close_env(env)
 
 
 def test_what_cannot_be_sent_there_is_not_sent() -> None:

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 
 from policies.envs.modules import allow_modules, allowed_modules
 from tune_jobs.process.state import given_back
@@ -99,6 +100,37 @@ def test_modules_that_the_user_allowed_stay_allowed(monkeypatch: pytest.MonkeyPa
         allow_modules(["of_the_sweep"])
         assert allowed_modules() == ("of_the_sweep", "of_the_user")
     assert allowed_modules() == ("of_the_user",)
+
+
+def test_what_torch_draws_and_may_do_at_random_is_as_before() -> None:
+    """RLlib seeds it and forbids it the rest, for each Algorithm."""
+
+    def state() -> list[Any]:
+        return [
+            torch.get_rng_state().tolist(), torch.are_deterministic_algorithms_enabled(),
+            torch.is_deterministic_algorithms_warn_only_enabled(), torch.backends.cudnn.deterministic,
+            torch.backends.cudnn.benchmark,
+        ]  # fmt: skip
+
+    before = state()
+    exact, warns, deterministic, benchmark = before[1:]
+    with given_back():
+        # Whatever earlier tests have left.
+        torch.rand(1)
+        torch.use_deterministic_algorithms(not exact, warn_only=not warns)
+        torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = not deterministic, not benchmark
+        assert not any(one == other for one, other in zip(before, state(), strict=True))
+    assert state() == before
+
+
+def test_what_a_program_has_frozen_of_torch_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `torch.backends.disable_global_flags` does, for good."""
+    backends: Any = torch.backends
+    # What freezes them is set there; `torch.backends` itself is another object.
+    monkeypatch.setitem(backends.flags_frozen.__globals__, "__allow_nonbracketed_mutation_flag", False)
+    assert backends.flags_frozen()
+    with given_back():
+        pass
 
 
 def test_it_works_in_any_thread() -> None:

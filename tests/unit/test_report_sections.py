@@ -56,6 +56,13 @@ def test_the_cost_of_a_pack_is_shared_by_its_trials() -> None:
     assert [row[column].text for row in table.rows] == ["5.0", "5.0"]
 
 
+@pytest.mark.parametrize(("num_env_steps", "said"), [(2, "0.4"), (7, "1.4"), (499, "99.8"), (501, "100"), (517, "103")])
+def test_a_slow_env_has_a_speed(num_env_steps: int, said: str) -> None:
+    synthetic = packed_pair()
+    facts = facts_of(with_trials(synthetic, num_env_steps=num_env_steps))
+    assert facts["speed"] == f"{said} env steps a core-second, evaluations included"
+
+
 def test_the_spread_of_what_trials_cost_is_told_in_whole_numbers() -> None:
     synthetic = packed_pair()
     synthetic.trials[:] = [

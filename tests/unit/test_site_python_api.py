@@ -64,6 +64,12 @@ def raised(text: str) -> list[str]:
     return [] if section is None else re.findall(r"^    (\w+): ", section[1], re.MULTILINE)
 
 
+def test_a_star_imports_every_name_of_the_api() -> None:
+    names: dict[str, Any] = {}
+    exec("from tune_jobs import *", names)
+    assert names.keys() - {"__builtins__"} == tune_jobs._HOME.keys()
+
+
 def test_all_that_tune_jobs_has_is_on_the_page() -> None:
     assert {name for name in tune_jobs._HOME if f"tune_jobs.{name}" not in ENTRIES} == set()
 

@@ -14,8 +14,9 @@ from analysis.best_records import BestRecord, EvaluationRecord
 from analysis.records import FORMAT_VERSION, CheckpointRecord
 from policies.errors import CannotRunError, CheckpointError, NotFoundError, SpecError
 from tests.narrowing import present
+from tune_jobs.store.local_storage import LocalStorage
 from tune_jobs.store.manifests import read_manifest, verify_checkpoint
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
+from tune_jobs.store.sweep_store import SweepStore
 from tune_jobs.store.trial_store import TrialStore
 
 
@@ -98,7 +99,7 @@ def test_what_is_not_there_is_not_found(store: SweepStore, trial: TrialStore, tm
     assert trial.read_iterations() == []
     assert trial.checkpoints() == []
     assert trial.log_tail() == ""
-    assert list_sweep_stores(tmp_path / "nowhere") == []
+    assert LocalStorage(tmp_path / "nowhere").sweeps() == []
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ def test_sweeps_are_listed_by_name(tmp_path: Path) -> None:
         store.write_record(make_sweep(name=name))
     SweepStore(tmp_path / "half").create()
     (tmp_path / "file").write_text("")
-    assert [store.name for store in list_sweep_stores(tmp_path)] == ["a", "b"]
+    assert [store.name for store in LocalStorage(tmp_path).sweeps()] == ["a", "b"]
 
 
 # -- results

@@ -6,7 +6,14 @@ import shlex
 
 import click
 
-from tune_jobs.cli.base import json_option, losing_what_nobody_reads, stdout_for, storage_option, sweep_argument
+from tune_jobs.cli.base import (
+    json_option,
+    losing_what_nobody_reads,
+    say_left,
+    stdout_for,
+    storage_option,
+    sweep_argument,
+)
 from tune_jobs.cli.server import here_only
 from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 
@@ -42,12 +49,8 @@ def show_until_end(sweep: str, *, storage: str | None, progress: str, as_json: b
             result = follow(sweep, storage=storage, progress=progress)
     except KeyboardInterrupt:
         name = shlex.quote(sweep)
-        message = f"No longer shown; {sweep} goes on."
         hint = f"See it again: tune-jobs attach {name}{at}. Stop it: tune-jobs stop {name}{at}"
-        with losing_what_nobody_reads(True):  # noqa: FBT003
-            click.echo(f"{message} {hint}", err=True)
-            if as_json:
-                output.print_json({"error": message, "hint": hint, "exit_code": INTERRUPTED})
+        say_left(f"No longer shown; {sweep} goes on.", hint, as_json=as_json)
         return INTERRUPTED
     with losing_what_nobody_reads(result.interrupted):
         output.show_result(result, as_json=as_json)

@@ -277,7 +277,7 @@ def result_of(call: Callable[..., SweepResult], *args: Any, **kwargs: Any) -> Sw
 def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT001
     """Ignore errors of printing in the block if the reader of a pipe or the terminal is gone, or on an interrupt.
 
-    A sweep that has run does not count as failed because of that.
+    A sweep that has run does not count as failed because of that. The other stream is printed to as before.
     """
     try:
         yield
@@ -286,12 +286,24 @@ def losing_what_nobody_reads(interrupted: bool) -> Iterator[None]:  # noqa: FBT0
     except OSError as error:
         if not interrupted and error.errno not in _NOBODY_READS:
             raise
-        _write_nowhere(1, 2)
+        for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+            try:
+                stream.flush()
+            except OSError:
+                _write_nowhere(number)
 
 
-def _write_nowhere(*numbers: int) -> None:
-    """Send descriptors to nowhere from now on, as Python flushes standard output and error once more at its end."""
+def say_left(message: str, hint: str, *, as_json: bool) -> None:
+    """Say that an interrupt has ended a command, and what to do now, on each stream that somebody reads."""
+    with losing_what_nobody_reads(True):  # noqa: FBT003
+        click.echo(f"{message} {hint}", err=True)
+    if as_json:
+        with losing_what_nobody_reads(True):  # noqa: FBT003
+            _print_json_error(message, hint, INTERRUPTED)
+
+
+def _write_nowhere(number: int) -> None:
+    """Send a descriptor to nowhere from now on, as Python flushes standard output and error once more at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    for number in numbers:
-        os.dup2(nowhere, number)
+    os.dup2(nowhere, number)
     os.close(nowhere)

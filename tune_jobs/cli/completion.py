@@ -1,7 +1,7 @@
 """What a shell completes: presets and sweep files, the names of sweeps, a sweep's trials.
 
 Click prints the shell's part, for which docs/reference/commands.md has a line. Nothing here may fail or print: a folder
-that cannot be read has nothing to complete, and neither has a service that does not answer at once.
+that cannot be read has nothing to complete, and neither has a service or an object store that does not answer at once.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _SUFFIXES = (".yaml", ".yml")
 _PATIENCE_S = 1.5
-"""How long a service is waited for."""
+"""How long a service or a storage is waited for."""
 _MOST_SEARCHED = 100
 """Characters that a service takes to search for."""
 _BREAKS = (":", "=")
@@ -121,7 +121,8 @@ def _sweep_names(ctx: click.Context, incomplete: str) -> list[str]:
     from tune_jobs.sweeps.storage import storage_place
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):
-        return [sweep.name for sweep in open_storage(storage_place(ctx.params.get("storage"))).sweeps()]
+        storage = open_storage(storage_place(ctx.params.get("storage")))
+        return _within_patience(lambda: [sweep.name for sweep in storage.sweeps()])
     return []
 
 
@@ -145,13 +146,11 @@ def _searched_names(ctx: click.Context, sweep: str) -> list[str]:
 
 
 def _asked(server: Server, names: Callable[[Client], list[str]]) -> list[str]:
-    """Return what a service says, if it does within the time for which somebody waits after pressing Tab."""
-    found: list[str] = []
+    """Return what a service says, if it does at once."""
 
-    def ask(client: Client) -> None:
-        # Whatever goes wrong is told by the command itself, once it is run.
-        with contextlib.suppress(Exception), client:
-            found.extend(names(client))
+    def ask(client: Client) -> list[str]:
+        with client:
+            return names(client)
 
     was_silent_below = logging.root.manager.disable
     logging.disable()
@@ -159,12 +158,25 @@ def _asked(server: Server, names: Callable[[Client], list[str]]) -> list[str]:
         with contextlib.suppress(Exception):
             # Made before, as what it imports takes longer than an answer does.
             client = server.client(timeout_s=_PATIENCE_S)
-            # A thread, as looking a host's name up, and answers that come drop by drop, have no timeout of their own.
-            asking = threading.Thread(target=ask, args=(client,), daemon=True)
-            asking.start()
-            asking.join(_PATIENCE_S)
+            return _within_patience(lambda: ask(client))
     finally:
         logging.disable(was_silent_below)
+    return []
+
+
+def _within_patience(names: Callable[[], list[str]]) -> list[str]:
+    """Return names, if they come within the time for which somebody waits after pressing Tab."""
+    found: list[str] = []
+
+    def ask() -> None:
+        # Whatever goes wrong is told by the command itself, once it is run.
+        with contextlib.suppress(Exception):
+            found.extend(names())
+
+    # A thread, as looking a host's name up, and answers that come drop by drop, have no timeout of their own.
+    asking = threading.Thread(target=ask, daemon=True)
+    asking.start()
+    asking.join(_PATIENCE_S)
     return list(found)
 
 
@@ -175,5 +187,5 @@ def _of_sweep(ctx: click.Context, sweep: str, names: Callable[[Sweep], list[str]
 
     with contextlib.suppress(TuneJobsError, OSError, ValueError):
         store = open_storage(storage_place(ctx.params.get("storage"))).sweep(sweep)
-        return names(store) if store.exists() else []
+        return _within_patience(lambda: names(store) if store.exists() else [])
     return []

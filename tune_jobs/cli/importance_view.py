@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tune_jobs.cli.output import make_console, make_table, print_json
+from tune_jobs.cli.whole_columns import print_whole
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,8 +32,8 @@ def show_importance(found: WhatMattered, *, as_json: bool) -> None:
             bar = "█" * round(_BAR * (item.share or 0.0))
             verdict = "mattered" if item.is_clear else "may be chance"
             style = "" if item.is_clear else "dim"
-            table.add_row(item.name, percent(item.share), interval(item), bar, verdict, style=style)
-        console.print(table)
+            table.add_row(item.name, percent(item.share), interval(item), verdict, bar, style=style)
+        print_whole(console, table)
     if found.effects:
         _show_effects(console, found)
 
@@ -53,7 +54,7 @@ def _show_effects(console: Console, found: WhatMattered) -> None:
                 score_interval(level.low, level.high, found.objective),
             ]
             table.add_row(effect.name if level is effect.levels[0] else "", *cells)
-    console.print(table)
+    print_whole(console, table)
     for effect in found.effects:
         if effect.why_not_comparable:
             console.print(f"Not comparable: {effect.why_not_comparable}", style="yellow")

@@ -50,22 +50,28 @@ def print_json(value: Any) -> None:
 
 def show_result(result: SweepResult, *, as_json: bool) -> None:
     """Print the result of a launch, resume or extend, and the paths of its files."""
+    try:
+        _print_result(result, as_json=as_json)
+    finally:
+        # Also where nobody reads the result: Ctrl-C ends a pipe's reader too.
+        if result.interrupted:
+            # Most commands that print something need no store, which takes as long to load as all else here.
+            from tune_jobs.store.opening import open_sweep, resume_command
+
+            say_interrupted(result.sweep, resume_command(open_sweep(result.place), result.sweep))
+
+
+def _print_result(result: SweepResult, *, as_json: bool) -> None:
     if as_json:
         print_json({**to_json(result), "exit_code": result.exit_code})
-    else:
-        from analysis.wording import shown_path
+        return
+    from analysis.wording import shown_path
 
-        made = {name: shown_path(path) for name, path in result.artifacts.items()}
-        paths = {"sweep": shown_path(result.place), **made}
-        print_outcome(
-            result.sweep, result.trials, best=result.best, why_no_best=result.why_no_best, paths=paths,
-            notes=result.notes,
-        )  # fmt: skip
-    if result.interrupted:
-        # Most commands that print something need no store, which takes as long to load as all else here.
-        from tune_jobs.store.opening import open_sweep, resume_command
-
-        say_interrupted(result.sweep, resume_command(open_sweep(result.place), result.sweep))
+    made = {name: shown_path(path) for name, path in result.artifacts.items()}
+    print_outcome(
+        result.sweep, result.trials, best=result.best, why_no_best=result.why_no_best,
+        paths={"sweep": shown_path(result.place), **made}, notes=result.notes,
+    )  # fmt: skip
 
 
 def print_outcome(

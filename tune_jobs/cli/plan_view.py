@@ -9,6 +9,7 @@ from analysis.points import searched_names, value_text
 from analysis.records import TRAINING_LENGTH
 from analysis.wording import bytes_text, counted
 from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
+from tune_jobs.cli.whole_columns import print_whole
 from tune_jobs.search.subpopulations import subpopulation_of
 from tune_jobs.spec.training_length import ends_of
 
@@ -38,7 +39,7 @@ def show_plan(spec: SweepSpec, plan: SweepPlan, *, as_json: bool, finish: bool =
     print_facts(console, _plan_facts(spec, plan, finish=finish))
     for note in (*plan.notes, *(plan.packs.notes if plan.packs is not None else ())):
         console.print(f"note: {note}", style="yellow")
-    console.print(_plan_table(spec, plan))
+    print_whole(console, _plan_table(spec, plan))
     hidden = len(plan.trials) - _MAX_TRIALS_SHOWN
     if hidden > 0:
         console.print(f"and {hidden:,} more; --json lists them all")

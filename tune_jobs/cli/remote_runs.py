@@ -13,7 +13,7 @@ import click
 
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
 from policies.errors import NotFoundError, SpecError, TuneJobsError, fit
-from tune_jobs.cli.base import losing_what_nobody_reads, stdout_for
+from tune_jobs.cli.base import losing_what_nobody_reads, say_left, stdout_for
 from tune_jobs.cli.remote import told_here
 from tune_jobs.cli.server import Server
 from tune_jobs.client.answers import Job, Summary
@@ -62,7 +62,10 @@ def run_there(
 
     with server.client() as client, stdout_for(as_json=as_json):
         found = _done(server, client, verb, arguments, options, say)
-    return _say_left(found, as_json=as_json) if isinstance(found, _Left) else _show(found, server, as_json=as_json)
+    if isinstance(found, _Left):
+        say_left(*found, as_json=as_json)
+        return INTERRUPTED
+    return _show(found, server, as_json=as_json)
 
 
 class _Left(NamedTuple):
@@ -118,16 +121,6 @@ def _telling(what: str, hint: str) -> Iterator[None]:
         raise
     except TuneJobsError as error:
         raise error.again(f"{what}: {error.message}", hint) from error
-
-
-def _say_left(left: _Left, *, as_json: bool) -> int:
-    with losing_what_nobody_reads(True):  # noqa: FBT003
-        click.echo(" ".join(left), err=True)
-        if as_json:
-            from tune_jobs.cli.output import print_json
-
-            print_json({"error": left.message, "hint": left.hint, "exit_code": INTERRUPTED})
-    return INTERRUPTED
 
 
 def _begun(client: Client, verb: str, arguments: Sequence[Any], options: dict[str, Any]) -> Job:
@@ -259,7 +252,8 @@ def _show(result: dict[str, Any], server: Server, *, as_json: bool) -> int:
                 result["sweep"], result["trials"], best=result["best"], why_no_best=result["why_no_best"],
                 paths={"sweep": result["folder"], **result["artifacts"]}, notes=result["notes"],
             )  # fmt: skip
-        if result["interrupted"]:
+    if result["interrupted"]:
+        with losing_what_nobody_reads(True):  # noqa: FBT003
             output.say_interrupted(result["sweep"], f"{server.program} resume {shlex.quote(result['sweep'].name)}")
     code: int = result["exit_code"]
     return code

@@ -41,8 +41,9 @@ def run_verb(
 
     with stdout_for(as_json=as_json):
         result = result_of(getattr(sweeps, verb), *arguments, storage=storage, **options)
-    with losing_what_nobody_reads(result.interrupted):
-        if verb == "extend" and result.interrupted:
+    if verb == "extend" and result.interrupted:
+        with losing_what_nobody_reads(True):  # noqa: FBT003
             click.echo("The samples are in the sweep by now: extend again would add as many once more.", err=True)
+    with losing_what_nobody_reads(result.interrupted):
         cli_output.show_result(result, as_json=as_json)
     ctx.exit(result.exit_code)

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from tune_jobs.cli.output import local_time, make_console, make_table, print_json
+from tune_jobs.cli.whole_columns import print_whole
 from tune_jobs.service.access.tokens import Token
 
 
@@ -35,7 +36,7 @@ def show_tokens(tokens: Sequence[Token], now: float, *, as_json: bool) -> None:
         times = (token.created_at, token.expires_at, token.last_used_at)
         told = ("never" if time is None else local_time(time) for time in times)
         table.add_row(token.id, token.name, token.role, token.state(now), *told)
-    console.print(table)
+    print_whole(console, table, least=("made",))
 
 
 def show_revoked(token: Token, *, as_json: bool) -> None:

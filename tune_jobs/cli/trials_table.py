@@ -21,6 +21,7 @@ from tune_jobs.cli.output import (
     print_json,
     print_trial_notes,
 )
+from tune_jobs.cli.whole_columns import print_left_out, terminal_width
 from tune_jobs.sweeps.columns import Fit, fit
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def show_trials(
         print_json(shown)
         return
     console = make_console()
-    print_table(console, shown, among=trials, width=console.width if console.is_terminal else None, first=sort)
+    print_table(console, shown, among=trials, width=terminal_width(console), first=sort)
     if len(shown) < len(trials):
         console.print(f"{len(shown):,} of {counted(len(trials), 'trial')}", style="dim")
     print_trial_notes(console, shown)
@@ -122,12 +123,7 @@ def print_table(
     # Lines of a pipe are never wrapped.
     console.print(Text("\n").join(lines), soft_wrap=True)
     missing = [columns[position].title for position in fitting.left_out]
-    if missing:
-        console.print(
-            f"Left out, as {width} columns are too few: {', '.join(missing)}. "
-            "To see them, widen the terminal, or add --json.",
-            style="dim",
-        )
+    print_left_out(console, missing)
     if "ended by" in missing:
         _print_failures(console, trials)
 

@@ -33,6 +33,13 @@ _MOST_CHANNELS = 16
 _LONG_EPISODE_S = 60.0
 _FEW_NUMBERS = 3_000
 """An image of fewer numbers, as one of 31 x 31 pixels in colour, may well be seen as a vector."""
+_INSTEAD_OF_SCALED_REWARDS = {
+    "ppo": ", and set hyperparams.normalize_rewards: true, which scales what is learned from, and no score",
+    "dqn": ", and set hyperparams.reward_scale, which scales what is learned from, and no score",
+}
+_INSTEAD_OF_SCALED_OBSERVATIONS = (
+    ", and set hyperparams.normalize_observations: true, by which a policy is evaluated and saved, too"
+)
 
 
 def env_notes(spec: SweepSpec, env: EnvInfo, packs: PackPlan | None = None) -> list[str]:
@@ -81,13 +88,7 @@ def _on_actions(env: EnvInfo) -> Iterator[str]:
 
 
 def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterator[str]:
-    if env.unrepeated is not None:
-        yield (
-            f"{env.env_id} was reset twice with the same seed, and its first observation differs: {env.unrepeated}. "
-            "Where an episode depends on more than its seed, a policy that is evaluated again on the same seeds gets "
-            "other returns. Let reset() leave nothing of the episode before, and draw all random numbers from "
-            "self.np_random."
-        )
+    yield from _on_repeats(spec, env)
     if step_us is not None and env.max_episode_steps is None:
         longest_s = step_us / 1e6 * MAX_EPISODE_STEPS
         if longest_s >= _LONG_EPISODE_S:
@@ -108,6 +109,33 @@ def _on_episodes(spec: SweepSpec, env: EnvInfo, step_us: float | None) -> Iterat
         yield (
             f"env.args.max_episode_steps {asked:,} never acts: {env.env_id} cuts off episodes after "
             f"{env.max_episode_steps:,} env steps by itself. {where}"
+        )
+
+
+def _on_repeats(spec: SweepSpec, env: EnvInfo) -> Iterator[str]:
+    """Yield what is to be told of an environment whose episodes depend on those before."""
+    carried = env.carried
+    if carried.scales_rewards:
+        yield (
+            f"{env.env_id} has a NormalizeReward around it, which divides rewards by what it has seen since it was "
+            "made: one policy gets another score each time, and scores can't be compared. Leave it out"
+            f"{_INSTEAD_OF_SCALED_REWARDS.get(spec.algorithm, '')}."
+        )
+    if carried.scales_observations:
+        instead = "" if spec.algorithm in BASELINES else _INSTEAD_OF_SCALED_OBSERVATIONS
+        yield (
+            f"{env.env_id} has a NormalizeObservation around it, which normalises by what it has seen since it was "
+            "made: a policy is evaluated on other observations than it is trained on, and is saved without what they "
+            f"were normalised by. Leave it out{instead}."
+        )
+    told = f"and its first observation differs: {env.unrepeated}" if env.unrepeated is not None else None
+    if told is None and carried.step is not None:
+        told = f"and given the same action, and its first step differs: {carried.step}"
+    if told is not None and not (carried.scales_rewards or carried.scales_observations):
+        yield (
+            f"{env.env_id} was reset twice with the same seed, {told}. Where an episode depends on more than its seed, "
+            "a policy that is evaluated again on the same seeds gets other returns. Let reset() leave nothing of the "
+            "episode before, and draw all random numbers from self.np_random."
         )
 
 

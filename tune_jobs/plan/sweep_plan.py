@@ -250,7 +250,7 @@ def make_plan(
             *memory_notes,
             *outside_notes(spec, chosen_points),
             *repeated_notes(chosen_points, searched),
-            *prior_notes(spec, prior),
+            *prior_notes(spec, prior, env.env_id),
         ),
         packs=packs,
         prior=tuple(prior),

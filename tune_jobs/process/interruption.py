@@ -74,8 +74,7 @@ class Interruption:
         Raises:
             KeyboardInterrupt: There is nothing to ask (any more), and nothing that must not be cut short.
         """
-        global _num_taken  # noqa: PLW0603 (a process has one set of handlers)
-        _num_taken += 1
+        _taken.append(number)
         self.came = True
         if self._num_shields:
             return
@@ -114,7 +113,7 @@ class Interruption:
 
 _current = Interruption()
 _is_driving = False
-_num_taken = 0
+_taken: list[int] = []
 
 
 def current() -> Interruption:
@@ -132,7 +131,12 @@ def can_drive() -> bool:
 
 def num_taken() -> int:
     """Return how many signals have come to the sweeps that this process has run in its main thread."""
-    return _num_taken
+    return len(_taken)
+
+
+def was_taken(number: int) -> bool:
+    """Return whether a signal has come to this process, while it ran a sweep or at another time."""
+    return number in _taken
 
 
 def main_thread_was_interrupted() -> bool:

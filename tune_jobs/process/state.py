@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ def given_back() -> Iterator[None]:
         stack.enter_context(standard_streams())
         stack.enter_context(warnings.catch_warnings())
         stack.enter_context(allowed_again())
-        for keep in (_variables, _hooks, _signal_handlers, _loggers, _random_numbers, _file_limit):
+        for keep in (_variables, _hooks, _signal_handlers, _loggers, randomness_given_back, _file_limit):
             stack.enter_context(keep())
         yield
 
@@ -117,20 +117,43 @@ def _settings(logger: logging.Logger) -> tuple[int, list[logging.Handler], bool,
 
 
 @contextlib.contextmanager
-def _random_numbers() -> Iterator[None]:
-    """Restore the state of the global generators; torch's only if torch is already loaded."""
+def randomness_given_back() -> Iterator[None]:
+    """Restore the state of the global generators, and what torch may do at random, if torch is already loaded.
+
+    RLlib seeds them all for each Algorithm with a seed, and has torch do nothing at random from then on.
+    """
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (other people's)
     torch: Any = sys.modules.get("torch")
-    drawn = None if torch is None else (torch.get_rng_state(), torch.get_num_threads())
+    restore_torch = None if torch is None else _of_torch(torch)
     try:
         yield
     finally:
         random.setstate(python)
         np.random.set_state(numpy)  # noqa: NPY002
-        if drawn is not None:
-            torch.set_rng_state(drawn[0])
-            if torch.get_num_threads() != drawn[1]:
-                torch.set_num_threads(drawn[1])
+        if restore_torch is not None:
+            restore_torch()
+
+
+def _of_torch(torch: Any) -> Callable[[], None]:
+    """Return what restores torch's present state."""
+    drawn, num_threads, cudnn = torch.get_rng_state(), torch.get_num_threads(), torch.backends.cudnn
+    drawn_on_gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else None
+    of_cudnn = cudnn.deterministic, cudnn.benchmark
+    is_exact, warns = torch.are_deterministic_algorithms_enabled, torch.is_deterministic_algorithms_warn_only_enabled
+    exact = is_exact(), warns()
+
+    def restore() -> None:
+        torch.set_rng_state(drawn)
+        if drawn_on_gpus is not None:
+            torch.cuda.set_rng_state_all(drawn_on_gpus)
+        if (cudnn.deterministic, cudnn.benchmark) != of_cudnn:  # they can't be set where a program froze them
+            cudnn.deterministic, cudnn.benchmark = of_cudnn
+        if (is_exact(), warns()) != exact:
+            torch.use_deterministic_algorithms(exact[0], warn_only=exact[1])
+        if torch.get_num_threads() != num_threads:
+            torch.set_num_threads(num_threads)
+
+    return restore
 
 
 @contextlib.contextmanager

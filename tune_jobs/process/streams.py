@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import IO
 
 from policies.errors import fit
 from policies.files import open_to_append
+from policies.standard_streams import has_standard_error
 from tune_jobs.process.interruption import current
 
 
@@ -37,14 +39,25 @@ _shown_on: list[_PatientStream] = []
 
 
 def standard_error() -> int:
-    """Return the descriptor of the real standard error, also while number 2 is sent to a file."""
-    return _shown_on[-1].fileno() if _shown_on else 2
+    """Return the descriptor of the real standard error, also while number 2 is sent to a file; DEVNULL: there is none.
+
+    Of a process that was started without it, number 2 may be a file of the user's.
+    """
+    if _shown_on:
+        return _shown_on[-1].fileno()
+    return 2 if has_standard_error() else subprocess.DEVNULL
+
+
+def _stream() -> _PatientStream:
+    number = standard_error()
+    own = os.open(os.devnull, os.O_WRONLY) if number == subprocess.DEVNULL else os.dup(number)
+    return _PatientStream(os.fdopen(own, "wb"), encoding="utf-8")
 
 
 @contextlib.contextmanager
 def patient_stream() -> Iterator[IO[str]]:
     """Yield a stream to the real standard error that drops what cannot be written there."""
-    with _PatientStream(os.fdopen(os.dup(standard_error()), "wb"), encoding="utf-8") as stream:
+    with _stream() as stream:
         yield stream
 
 
@@ -61,7 +74,7 @@ def quiet(log: Path) -> Iterator[IO[str]]:
     _flush()
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(open_to_append(log))
-        stream = stack.enter_context(_PatientStream(os.fdopen(os.dup(2), "wb"), encoding="utf-8"))
+        stream = stack.enter_context(_stream())
         _shown_on.append(stream)
         stack.callback(_shown_on.remove, stream)
         stack.enter_context(_elsewhere(1, file))

@@ -21,6 +21,7 @@ from ray.exceptions import AuthenticationError
 from policies.errors import CannotRunError
 from tune_jobs.plan.machine import Machine
 from tune_jobs.process.interruption import current
+from tune_jobs.process.state import randomness_given_back
 from tune_jobs.process.streams import quiet
 from tune_jobs.ray_tune.address import named_cluster, recorded_cluster
 from tune_jobs.ray_tune.answering import check_is_ray, wrong_token
@@ -31,7 +32,7 @@ from tune_jobs.ray_tune.connected_ray import (
     is_client,
     of_a_sweep,
 )
-from tune_jobs.ray_tune.environment import prepare_environment
+from tune_jobs.ray_tune.environment import prepare_environment, variables_for_start
 from tune_jobs.ray_tune.forks import ForkServer, fork_server
 from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, outside_of_uv, start, without_environments
 from tune_jobs.ray_tune.processes import ending_if_it_fails
@@ -107,6 +108,31 @@ def connect(
             with current().shielded(), _not_collecting():
                 ray.shutdown()
                 logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def left_running(machine: Machine) -> Iterator[None]:
+    """Start a Ray of this machine, unless one is joined, which runs on after the block if that does not fail.
+
+    Args:
+        machine: The CPUs and GPUs to start it with.
+
+    Raises:
+        CannotRunError: It does not start.
+    """
+    if ray.is_initialized():
+        yield
+        return
+    logger = logging.getLogger("ray")
+    level = logger.level
+    with ending_if_it_fails():
+        try:
+            # Ray draws numbers, too.
+            with _keeping_sigterm(), randomness_given_back(), variables_for_start():
+                start(machine)
+        finally:
+            logger.setLevel(level)
+        yield
 
 
 @contextlib.contextmanager

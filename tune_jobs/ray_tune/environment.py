@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
 
 _TRIAL_CLEANUP_S = 5
@@ -22,12 +24,29 @@ _ENVIRONMENT = {
 # Read by a Ray that is started here, unless the user says otherwise. By Ray's own default of 15 its processes get 3 %
 # of a core beside anything else that runs there. Those that are forked have none of it.
 _NICENESS = "RAY_worker_niceness", "0"
+# Set as a Ray is started, see `local_ray`.
+_USAGE = "RAY_USAGE_STATS_ENABLED"
 
 
 def prepare_environment() -> None:
     """Set the variables that Ray and Ray Tune read; call it before Ray starts, so that its workers inherit them."""
     os.environ.update(_ENVIRONMENT)
     os.environ.setdefault(*_NICENESS)
+
+
+@contextlib.contextmanager
+def variables_for_start() -> Iterator[None]:
+    """Let a Ray that is started in the block have a sweep's niceness, and give back the variables that say so.
+
+    Its token stays, which other processes need to join it.
+    """
+    names = {_NICENESS[0], _USAGE} - os.environ.keys()
+    os.environ.setdefault(*_NICENESS)
+    try:
+        yield
+    finally:
+        for name in names:
+            os.environ.pop(name, None)
 
 
 def provide_token() -> None:

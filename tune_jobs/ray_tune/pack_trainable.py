@@ -27,6 +27,7 @@ from tune_jobs.ray_tune.trainable import (
     TaskReader,
     TrialLog,
     end_with_driver,
+    look_in_folders,
     owner_of_run,
     this_node,
     watchdog,
@@ -61,6 +62,7 @@ class PackTrainable(tune.Trainable):  # type: ignore[misc]
         # Meanwhile other things are done that wait for the storage, or need none.
         self._ahead = ThreadPoolExecutor(1, "ahead")
         self._reading = self._ahead.submit(TaskReader, config["sweep_place"])
+        look_in_folders(config)
         self._refusal = refusal(config)
         if self._refusal is not None:
             return

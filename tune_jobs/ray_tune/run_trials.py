@@ -19,11 +19,13 @@ from ray.tune.experiment import Trial
 from ray.tune.schedulers import TrialScheduler
 from ray.tune.search import SearchAlgorithm, Searcher
 
+from policies.envs.modules import module_folders
 from policies.errors import CannotRunError
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
 from tune_jobs.process.interruption import EXIT_CODE, current, last_words
 from tune_jobs.process.ran_with import versions
+from tune_jobs.ray_tune.connected_ray import is_of_a_sweep
 from tune_jobs.ray_tune.early_stopping import build_tune_scheduler
 from tune_jobs.ray_tune.environment import prepare_environment
 from tune_jobs.ray_tune.failures import going_on
@@ -159,6 +161,9 @@ class _Run:
         if self._record.address is not None:
             # As one text: Tune copies the settings of each trial some times, part by part.
             self._config["versions"] = json.dumps(versions())
+        if not is_of_a_sweep() and (folders := module_folders()):
+            # What a sweep starts Ray with has them on its path; a user's may have been started before they were there.
+            self._config["folders"] = json.dumps(folders)
         self._spec = stored_spec(self._record)
         self.keeper = RecordKeeper(store, job.trial_ids, listener, run=owner)
         self.waits = RunWaits(store, self.keeper)

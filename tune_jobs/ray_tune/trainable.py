@@ -24,7 +24,7 @@ from ray.train._internal.checkpoint_manager import _TrainingResult
 
 from policies.acting.evaluate import Evaluator
 from policies.envs.faults import note_signals
-from policies.envs.modules import allow_modules
+from policies.envs.modules import allow_modules, look_in
 from policies.envs.tallies import end_tally
 from policies.errors import CheckpointError, fit, tellable
 from policies.files import open_to_append
@@ -156,6 +156,11 @@ def owner_of_run(config: Mapping[str, Any]) -> Ownership | None:
     return open_sweep(config["sweep_place"]).owner(config["run"]) if config.get("run") else None
 
 
+def look_in_folders(config: Mapping[str, Any]) -> None:
+    """Let this process find the user's own modules where the driver did; Ray itself passes on no path of Python's."""
+    look_in(json.loads(config.get("folders", "[]")))
+
+
 def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> None:
     """End this process when its driver has ended, for whatever reason, or another process owns its work.
 
@@ -174,7 +179,7 @@ def end_with_driver(config: Mapping[str, Any], *owners: Ownership | None) -> Non
 class TrialTrainable(tune.Trainable):  # type: ignore[misc]
     """Runs trials; `config` holds `sweep_place` and `trial_id`, and from the driver `run` and `driver`.
 
-    On a cluster it holds `versions` too; see `joined_nodes.refusal`.
+    On a cluster it holds `versions` too, see `joined_nodes.refusal`; in a user's Ray it may hold `folders`.
     """
 
     _refusal: NodeRefusedError | None = None
@@ -190,6 +195,7 @@ class TrialTrainable(tune.Trainable):  # type: ignore[misc]
         self._node = this_node()
         self._notice = DrainNotice()
         self._take(config)
+        look_in_folders(config)
         self._refusal = refusal(config)
         if self._refusal is None:
             self._run = owner_of_run(config)

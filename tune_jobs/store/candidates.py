@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from analysis.compact import CompactIterations
 from analysis.numbering import place_of
 from analysis.records import CheckpointRecord, SweepRecord, TrialRecord
+from analysis.wording import counted
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS, SWEEP_RECORD
@@ -61,16 +62,29 @@ def read_trials(store: Sweep) -> list[TrialRecord]:
 
 
 def read_results(store: Sweep) -> dict[str, CompactIterations]:
-    """Read every trial's results, by trial id; a file that cannot be read at all gives a warning and no results."""
+    """Read every trial's results, by trial id; those that cannot be read, or are gone, give a warning and are empty."""
     found = {}
     with store.reading():
         for record in readable_trials(store):
             try:
-                found[record.trial_id] = CompactIterations(store.trial(record.trial_id).read_iterations())
+                iterations = store.trial(record.trial_id).read_iterations()
             except CheckpointError as error:
                 leave_out(error)
-                found[record.trial_id] = CompactIterations([])
+                iterations = []
+            else:
+                # Of others, what has trained may not have been written: those that died, and those that train now.
+                if record.status in ("completed", "stopped") and record.num_iterations and not iterations:
+                    leave_out(_results_gone(store, record))
+            found[record.trial_id] = CompactIterations(iterations)
     return found
+
+
+def _results_gone(store: Sweep, record: TrialRecord) -> CheckpointError:
+    return CheckpointError(
+        f"The results of trial {record.trial_id} in {store.place}, which has trained for "
+        f"{counted(record.num_iterations, 'iteration')}, are gone: its {RESULTS} is missing or empty. It counts as a "
+        "training that showed nothing."
+    )
 
 
 def candidates(trial: Trial) -> list[CheckpointRecord]:

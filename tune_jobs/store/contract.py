@@ -284,6 +284,7 @@ class Sweep(Protocol):
             policy: Its policy; None: the present policy is kept.
 
         Raises:
+            NotFoundError: The sweep was removed.
             CannotRunError: It cannot be written.
         """
         ...
@@ -317,7 +318,7 @@ class Sweep(Protocol):
         """Yield the path for each of the films of the present winner; each file has to appear whole, in the block.
 
         Raises:
-            NotFoundError: No winner has been chosen.
+            NotFoundError: No winner has been chosen, or the sweep was removed; then nothing of the films is left.
             CheckpointError: Its record is damaged.
             CannotRunError: It can't be written whose films they are.
         """
@@ -339,6 +340,7 @@ class Sweep(Protocol):
         """Yield a local folder to write the report into, over the present one; each file has to appear whole.
 
         Raises:
+            NotFoundError: The sweep was removed; nothing of the report is left.
             CheckpointError: There is a symbolic link in it.
         """
         ...

@@ -7,8 +7,9 @@ from pathlib import Path, PurePath
 from policies.errors import NotFoundError
 from policies.files import absolute
 from tune_jobs.store.command_names import name_taken
+from tune_jobs.store.places import parts_of
 from tune_jobs.store.presence import is_link, is_there
-from tune_jobs.store.sweep_store import SweepStore, list_sweep_stores
+from tune_jobs.store.sweep_store import SweepStore
 
 _MAX_NAME_BYTES = 255
 
@@ -53,5 +54,9 @@ class LocalStorage:
         return is_link(folder) or is_there(folder)
 
     def sweeps(self) -> list[SweepStore]:
-        """Return the sweeps in the folder, by name."""
-        return list_sweep_stores(self._folder)
+        """Return the sweeps in the folder, by name; none if there is no such folder.
+
+        Raises:
+            CheckpointError: The folder cannot be read.
+        """
+        return [store for store in map(SweepStore, sorted(parts_of(self._folder))) if store.exists()]

@@ -33,6 +33,8 @@ from tune_jobs.store.trial_contract import Ownership
 # A single write of this length replaces the whole content, so a kill leaves either the old content or the new.
 _LINE_BYTES = 128
 _PATIENCE_S = 60.0
+_AWAY_S = 3.0
+"""How long a folder may be away before it counts as gone, as storages of other machines are for moments."""
 _BUSY = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
@@ -52,6 +54,7 @@ class Owner:
         self.path = path
         self.token = token
         self._descriptor: int | None = None
+        self._is_gone = False
         # File locks work between processes; this lock works between the threads of this process.
         self._lock = threading.Lock()
 
@@ -82,6 +85,8 @@ class Owner:
             CannotRunError: The file cannot be written or locked.
         """
         owner = cls(path, "")
+        if under is not None:
+            under.check()  # nothing is made in the folder of a sweep that is gone
         with owner._locked(makes=True) as descriptor:
             if under is not None:
                 under.check()
@@ -130,14 +135,10 @@ class Owner:
     def _locked(self, *, makes: bool = False) -> Iterator[int]:
         with self._lock:
             try:
-                if self._descriptor is None:
-                    if makes:
-                        self.path.parent.mkdir(parents=True, exist_ok=True)
-                    flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | (os.O_CREAT if makes else 0)
-                    self._descriptor = os.open(self.path, flags, 0o666)
-                refuse_others(os.fstat(self._descriptor), self.path)
-                self._wait(self._descriptor)
+                descriptor = self._in_place(makes=makes)
             except OSError as error:
+                # Not to be locked by who can't write.
+                self._close()
                 if not makes and isinstance(error, FileNotFoundError):
                     # It is not made anew: its folder may be gone, with the whole storage.
                     raise self._lost() from error
@@ -146,9 +147,46 @@ class Owner:
                     "Check its permissions, and that the file system of the storage has locks.",
                 ) from error
             try:
-                yield self._descriptor
+                yield descriptor
             finally:
-                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+
+    def _in_place(self, *, makes: bool) -> int:
+        """Return the file at the path, open and locked, which may be none for a moment, as its storage may."""
+        deadline = time.monotonic() + (0.0 if makes or self._is_gone else _AWAY_S)
+        while True:
+            try:
+                descriptor = self._opened(makes=makes)
+                self._wait(descriptor)
+                if not self._is_at_path(descriptor):
+                    # Somebody removed the folder, or replaced the file, as programs that synchronise folders do. Who
+                    # is the owner is in the file that is there now.
+                    self._close()
+                    descriptor = self._opened(makes=makes)
+                    self._wait(descriptor)
+            except FileNotFoundError:
+                if time.monotonic() >= deadline:
+                    self._is_gone = True
+                    raise
+                time.sleep(0.05)
+            else:
+                return descriptor
+
+    def _opened(self, *, makes: bool) -> int:
+        if self._descriptor is None:
+            if makes:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+            flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | (os.O_CREAT if makes else 0)
+            self._descriptor = os.open(self.path, flags, 0o666)
+        refuse_others(os.fstat(self._descriptor), self.path)
+        return self._descriptor
+
+    def _is_at_path(self, descriptor: int) -> bool:
+        """Whether an open file is still the one at the path."""
+        try:
+            return os.path.samestat(os.fstat(descriptor), os.lstat(self.path))
+        except FileNotFoundError:
+            return False
 
     def _wait(self, descriptor: int) -> None:
         """Lock the file, which other processes hold only for milliseconds."""
@@ -172,8 +210,15 @@ class Owner:
 
     def _lost(self) -> OwnershipLostError:
         by = ""
-        with contextlib.suppress(OSError):
+        try:
             by = " ".join(_line(self.path).split()[2:])
+        except FileNotFoundError:
+            return OwnershipLostError(
+                f"{self.path.parent} is gone, or has been taken over by another process.",
+                "This one writes nothing there any more.",
+            )
+        except OSError:
+            pass
         return OwnershipLostError(
             f"{self.path.parent} has been taken over by another process" + (f" ({by})." if by else "."),
             "Leave it to that process; this one writes nothing there any more.",

@@ -14,11 +14,12 @@ from pathlib import Path
 
 from analysis.best_records import BestRecord, FilmsRecord
 from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
-from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from policies.errors import CannotRunError, CheckpointError, NotFoundError, TuneJobsError
 from policies.files import absolute, write_atomic
 from policies.portable.file import PortablePolicy, save_policy
 from tune_jobs.store import names
 from tune_jobs.store.command_names import name_in_commands, name_taken, still_driven, watch_or_end
+from tune_jobs.store.fresh_look import FreshLook
 from tune_jobs.store.leftovers import remove_abandoned
 from tune_jobs.store.locks import held, is_held
 from tune_jobs.store.ownership import Owner
@@ -39,6 +40,7 @@ from tune_jobs.store.places import (
 from tune_jobs.store.presence import is_file
 from tune_jobs.store.probe import Probe, probing
 from tune_jobs.store.record_files import dump, dump_sealed, read_record
+from tune_jobs.store.removal import check_not_removed, put_aside, remove_sweep, unless_removed
 from tune_jobs.store.trial_store import TrialStore
 
 
@@ -53,6 +55,9 @@ class SweepStore:
         self._lock_path = self.folder / names.LOCK
         self._driver_lock_path = self.folder / names.DRIVER_LOCK
         self._made: list[Path] = []
+        self._aside: Path | None = None
+        """The folder that `discard` has removed, but for a file that is open."""
+        self._look = FreshLook(self.folder)
 
     @property
     def place(self) -> str:
@@ -130,7 +135,11 @@ class SweepStore:
 
     def discard(self) -> None:
         """Undo `create`: remove the folder, and the folders above it that it made."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        left = self.folder
+        with contextlib.suppress(OSError, TuneJobsError):
+            refuse_linked_sweep(self.folder)
+            left = self._aside = put_aside(self.folder)
+        shutil.rmtree(left, ignore_errors=True)
         with contextlib.suppress(OSError):
             for folder in self._made:
                 folder.rmdir()
@@ -141,19 +150,7 @@ class SweepStore:
         Raises:
             CannotRunError: A process drives the sweep, or the folder cannot be removed, such as a symbolic link.
         """
-        refuse_linked_sweep(self.folder)
-        # Under its own name, what a kill leaves of it would hold that for ever.
-        hidden = self.folder.with_name(f".{self.name}.deleted")
-        try:
-            with self.lock():
-                remove_folder(hidden)
-                remove_file(self.folder.replace(hidden) / names.SWEEP_RECORD)
-                shutil.rmtree(hidden)
-        except OSError as error:
-            left = hidden if hidden.exists() else self.folder
-            raise CannotRunError(
-                f"Sweep {self.name} cannot be removed as a whole: {error}.", f"Remove what is left of it: {left}."
-            ) from error
+        remove_sweep(self.folder, self.lock())
 
     @contextlib.contextmanager
     def rehearsal(self) -> Iterator[SweepStore]:
@@ -262,7 +259,11 @@ class SweepStore:
         Args:
             record: The content of best/evaluation.json.
             policy: The winner's policy; None: the present one is kept.
+
+        Raises:
+            NotFoundError: The sweep was removed.
         """
+        check_not_removed(self.folder)
         if policy is not None:
             save_policy(policy, self.best_folder)
         write_atomic(self.best_folder / names.BEST_RECORD, dump_sealed(record))
@@ -301,7 +302,8 @@ class SweepStore:
         record = within(folder, names.FILMS_RECORD)
         shown = self.read_best().checkpoint
         remove_file(record)
-        yield {key: folder / name for key, name in names.FILMS.items()}
+        with unless_removed(self.folder, folder):
+            yield {key: folder / name for key, name in names.FILMS.items()}
         write_atomic(record, dump_sealed(FilmsRecord(checkpoint=shown)))
 
     def current_report(self) -> Path | None:
@@ -320,14 +322,17 @@ class SweepStore:
     @contextlib.contextmanager
     def writing_report(self) -> Iterator[Path]:
         """Yield the folder to write the report into; it has no links in it."""
-        yield refuse_links_in(self.report_folder)
+        folder = refuse_links_in(self.report_folder)
+        with unless_removed(self.folder, folder):
+            yield folder
 
     def request_stop(self) -> None:
         """Ask the process that drives this sweep to stop."""
         write_atomic(self._stop_path, "stop\n")
 
     def stop_requested(self) -> bool:
-        """Whether a process asked to stop."""
+        """Whether a process asked to stop, on whichever machine."""
+        self._look.take()
         return self._stop_path.exists()
 
     def clear_stop_request(self) -> None:
@@ -379,6 +384,9 @@ class SweepStore:
             if is_held(self._driver_lock_path):
                 raise CannotRunError(*still_driven(self.name))
             yield
+        if self._aside is not None:
+            # The lock's file is open no longer.
+            shutil.rmtree(self._aside, ignore_errors=True)
 
     @contextlib.contextmanager
     def driver_lock(self) -> Iterator[None]:
@@ -389,12 +397,3 @@ class SweepStore:
         """
         with held(self._driver_lock_path, *still_driven(self.name)):
             yield
-
-
-def list_sweep_stores(storage: Path) -> list[SweepStore]:
-    """Return the sweeps in a storage folder, by name; none if there is no such folder.
-
-    Raises:
-        CheckpointError: The folder cannot be read.
-    """
-    return [store for store in map(SweepStore, sorted(parts_of(storage))) if store.exists()]

@@ -19,6 +19,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.names import SWEEP_RECORD
 from tune_jobs.store.transitions import pending_record, tried_again
+from tune_jobs.sweeps.changed_code import check_same_spaces, spaces_of
 
 
 def add_what_is_missing(
@@ -30,7 +31,11 @@ def add_what_is_missing(
     *,
     retry_failed: bool = False,
 ) -> SweepPlan:
-    """Plan the sweep of a record, and write the record and the trials that do not exist yet."""
+    """Plan the sweep of a record, and write the record and the trials that do not exist yet.
+
+    Raises:
+        CannotRunError: Its trials would be others now, or of another environment; nothing was written.
+    """
     _check_numbering(record, spec)
     trials = store.read_trials()
     plan = make_plan(
@@ -151,11 +156,12 @@ def _add_trials(
             todo.append(tried_again(before))
     if not todo and all(trial.status in FINISHED for trial in known.values()):
         return
+    check_same_spaces(record, known.values(), plan.env)
     # The sweep's record comes first: if this process is killed then, trials are missing, which a resume adds. Trials
     # that the sweep's spec does not give would be refused for good.
     changes = {"spec": spec.model_dump(mode="json"), "num_trials": len(plan.trials), "address": address}
     # The spec is written with all fields of this version.
-    changes |= {"format_version": FORMAT_VERSION, "state": "running"}
+    changes |= {"format_version": FORMAT_VERSION, "state": "running", "env_spaces": spaces_of(plan.env)}
     store.write_record(record.model_copy(update=changes))
     for trial_record in todo:
         store.trial(trial_record.trial_id).write_record(trial_record, soon=True)

@@ -143,7 +143,7 @@ def _refuse_twice(wanted: Sequence[Wanted], places: Sequence[str]) -> None:
     A copy in another folder is the same sweep until one of both goes on.
     """
     for (one, at), (other, other_at) in itertools.combinations(zip(wanted, places, strict=True), 2):
-        if not _is_copied(one, other) or one.point_index != other.point_index:
+        if one.origin != other.origin or one.point_index != other.point_index:
             continue
         # One that runs has gone on between two looks at it.
         if _trainings(one) == _trainings(other) or is_same_place(at, other_at):
@@ -158,7 +158,7 @@ def _told_of_copies(wanted: Mapping[str, Wanted], places: Sequence[str]) -> list
     """Say where a sweep and a copy of it, one of which has gone on, have trainings in common."""
     notes = []
     for (one, at), (other, other_at) in itertools.combinations(zip(wanted, places, strict=True), 2):
-        if not _is_copied(wanted[one], wanted[other]) or is_same_place(at, other_at):
+        if wanted[one].origin != wanted[other].origin or is_same_place(at, other_at):
             continue
         if same := [each for each in _trainings(wanted[one]) & _trainings(wanted[other]) if each.num_env_steps]:
             notes.append(
@@ -166,11 +166,6 @@ def _told_of_copies(wanted: Mapping[str, Wanted], places: Sequence[str]) -> list
                 "other's sweep: these are the same numbers twice, and the intervals take them for independent ones."
             )
     return notes
-
-
-def _is_copied(one: Wanted, other: Wanted) -> bool:
-    """Whether two are of one sweep, or of a copy of it, which has its name still."""
-    return (one.sweep.name, one.sweep.created_at) == (other.sweep.name, other.sweep.created_at)
 
 
 class _Training(NamedTuple):

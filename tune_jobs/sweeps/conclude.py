@@ -30,10 +30,13 @@ from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.manifests import is_checkpoint, verify_checkpoint
 from tune_jobs.store.presence import is_file
+from tune_jobs.store.writable import check_best_writable
 from tune_jobs.sweeps.current_best import has_current_best
-from tune_jobs.sweeps.drawing import ReportMatter, videos_of
+from tune_jobs.sweeps.drawing import write_report
 from tune_jobs.sweeps.drive import cpus_for_episodes
+from tune_jobs.sweeps.meanwhile import write_unless_outdated
 from tune_jobs.sweeps.policy_choice import choose_policy, episode_of, with_runners_up
+from tune_jobs.sweeps.read_only import policy_to_deploy
 from tune_jobs.sweeps.settings import judged
 from tune_jobs.sweeps.sources import find_sweep, names_baseline
 from tune_jobs.sweeps.storage import split_trial
@@ -59,7 +62,9 @@ def choose_best(store: Sweep, num_episodes: int = 100, say: Callable[[str], None
         NoUsableTrialError: No trial can win; the message says why.
         CheckpointError: The record of the sweep or of a trial is damaged.
         EnvError: The environment raised an error, hung, or ended its process.
+        CannotRunError: The sweep may only be read.
     """
+    check_best_writable(store)
     with store.reading():
         sweep = _trusted(store).read_record()
         # Of a sweep with a damaged trial nothing is chosen anew: the trial may be the one that would win.
@@ -90,8 +95,7 @@ def choose_best(store: Sweep, num_episodes: int = 100, say: Callable[[str], None
         settings=judged(spec, trials, results, confirmation.threshold),
         choice=with_runners_up(chosen, confirmation, timeout_s, num_processes, say),
     )
-    store.write_best(record, chosen.policy)
-    return record
+    return write_unless_outdated(store, sweep, record, chosen.policy)
 
 
 @guarding()
@@ -178,9 +182,7 @@ def find_policy(
         store, trial_id = _sweep_and_trial(text, storage)
         timeout_s = stored_spec(store.read_record()).iteration_timeout_s
         if trial_id is None:
-            if not has_current_best(store):
-                choose_best(store, say=say)
-            policy = load_policy(store.best_folder)
+            policy = policy_to_deploy(store, choose_best, say)
         else:
             checkpoint = store.checkpoint_folder(best_checkpoint(store, trial_id))
             verify_checkpoint(checkpoint)
@@ -327,6 +329,7 @@ def make_videos(store: Sweep, seed: int | None = None) -> dict[str, Path]:
     Returns:
         before_mp4, after_mp4, after_gif and before_after_mp4.
     """
+    check_best_writable(store)
     source = find_policy(store.place)
     best = store.read_best()
     chosen = best.confirmation.seeds[0] if seed is None else seed
@@ -383,11 +386,7 @@ def make_report(
     if isinstance(why_no_best, NoUsableTrialError):  # the report finds the reason in the trials
         why_no_best = None
     say("writing the report")
-    matter = ReportMatter.read(store, best, why_no_best)
-    videos = videos_of(store) if why_no_best is None else {}
-    with store.writing_report() as target:
-        name = matter.write(target, videos)
-    return store.report_files()[name]
+    return write_report(store, best, why_no_best)
 
 
 def _known_best(store: Sweep, say: Callable[[str], None]) -> BestRecord:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from analysis.best_records import BestRecord
-from analysis.records import SweepRecord, TrialRecord
+from analysis.records import FINISHED, CheckpointRecord, SweepRecord, TrialRecord
 from analysis.selection import is_current, policy_candidates
 from policies.errors import NotFoundError
 from tune_jobs.store.candidates import read_trials, readable_trials
@@ -68,3 +68,21 @@ def is_outdated(store: Sweep, best: BestRecord, trials: Sequence[TrialRecord]) -
     # Checkpoints that were damaged before it was chosen are in the records, and were not chosen among.
     found = read_trials(store)
     return bool(policy_candidates(found)) and not is_current(best, found)
+
+
+def winner_in_best_alone(store: Sweep) -> CheckpointRecord | None:
+    """Return the checkpoint that was chosen last if somebody deleted it since: of its policy best/ has the one copy.
+
+    Its trial's record has it still then. One that the trial deleted, as it trained on and kept others, it has not.
+    """
+    if not store.has_best():
+        return None
+    try:
+        best = store.read_best().checkpoint
+        trial = store.trial(best.trial_id)
+        if best.iteration in trial.checkpoint_iterations():
+            return None
+        record = trial.read_record()
+    except NotFoundError:  # a record is damaged or missing
+        return None
+    return best if record.status in FINISHED and best in record.checkpoints else None

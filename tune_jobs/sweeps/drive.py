@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -31,6 +30,7 @@ from tune_jobs.store.closing import close_run
 from tune_jobs.store.contract import Ownership, Sweep
 from tune_jobs.store.ownership import OwnershipLostError
 from tune_jobs.store.transitions import pending_record
+from tune_jobs.sweeps.changed_code import git_commit, spaces_of
 from tune_jobs.sweeps.forecast import caps_of
 from tune_jobs.sweeps.importing import import_what_runs_trials, importing_what_follows
 from tune_jobs.sweeps.monitor import SweepMonitor
@@ -49,12 +49,14 @@ def write_new(
     """Write the records of a new sweep, which is run at once or only created; return when it was created."""
     for trial in plan.trials:
         store.trial(trial.trial_id).write_record(pending_record(trial), soon=True)
+    # An id without its version may mean another environment by the next run, which is to train as this one does.
+    env = spec.env.model_copy(update={"id": plan.env.env_id})
     # Written last: a folder without this record is not a sweep, so no reader sees half of one.
     store.write_record(
         SweepRecord(
             name=store.name,
             state=state,
-            spec=spec.model_copy(update={"name": store.name}).model_dump(mode="json"),
+            spec=spec.model_copy(update={"name": store.name, "env": env}).model_dump(mode="json"),
             evaluation_seeds=plan.evaluation_seeds,
             confirmation_seeds=plan.confirmation_seeds,
             num_trials=len(plan.trials),
@@ -66,23 +68,12 @@ def write_new(
             chosen_points=given_points(spec),
             prior=plan.prior,
             env_threshold=plan.env.threshold,
+            env_spaces=spaces_of(plan.env),
             is_flattened=plan.env.is_flattened,
             is_masked=plan.env.mask is not None,
         )
     )
     return created_at
-
-
-def git_commit() -> str | None:
-    """Return the commit of the working directory's repository, which tells the version of a user's own code."""
-    try:
-        done = subprocess.run(
-            ["git", "rev-parse", "HEAD"],  # noqa: S607 (the user's git)
-            capture_output=True, text=True, timeout=5, check=False,
-        )  # fmt: skip
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() or None if done.returncode == 0 else None
 
 
 def connected(address: str | None, here: Machine | None, *, packs: bool = False) -> AbstractContextManager[Connection]:

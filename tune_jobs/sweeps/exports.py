@@ -203,7 +203,7 @@ def _figure(
     size: tuple[float, float],
 ) -> Figure:
     from analysis.exports.paper import learning_figure
-    from analysis.report_data import env_arguments_of, env_of
+    from analysis.report_data import are_one_env, env_arguments_of, env_of
     from tune_jobs.sweeps.sources import find_sweep
 
     if not names:
@@ -214,10 +214,11 @@ def _figure(
     first_id, first_arguments = env_of(records[0]), env_arguments_of(records[0])
     for label, record in zip(labels, records, strict=True):
         env_id = env_of(record)
-        if (env_id, env_arguments_of(record)) != (first_id, first_arguments):
+        is_one_env = are_one_env(env_id, first_id)
+        if not is_one_env or env_arguments_of(record) != first_arguments:
             raise SpecError(
                 f"Sweep {labels[0]} is on {first_id}, {label} on {env_id}"
-                f"{' with other arguments' if env_id == first_id else ''}: their returns have no common axis.",
+                f"{' with other arguments' if is_one_env else ''}: their returns have no common axis.",
                 "Draw them one by one.",
             )
     data = [sweep_data(store) for store in stores]

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from analysis.best_records import BestRecord
-from policies.errors import EnvFailedError, TuneJobsError
+from policies.errors import EnvFailedError, TuneJobsError, said_by
 from tune_jobs.process.interruption import current
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.drive import noted
 from tune_jobs.sweeps.outcome import SweepResult, notes_on_best
+
+_LOG = logging.getLogger(__name__)
 
 
 def finish_sweep(store: Sweep, result: SweepResult, progress: str = "none", *, keep: bool = False) -> SweepResult:
@@ -53,7 +56,7 @@ class _Finish:
         self.stopped = False
         """Whether another process asked to stop before everything was made."""
         self.failed = False
-        """Whether no winner could be confirmed, or the environment failed where it was filmed."""
+        """Whether no winner could be confirmed, the environment failed where it was filmed, or a library did."""
 
     @property
     def why_no_best(self) -> str | None:
@@ -63,6 +66,7 @@ class _Finish:
     def make_all(self) -> None:
         """Make everything that can be made."""
         from tune_jobs.sweeps import conclude as finish
+        from tune_jobs.sweeps.current_best import winner_in_best_alone
         from tune_jobs.sweeps.policy_choice import confirmed_best
         from tune_jobs.sweeps.settings import with_present_settings
 
@@ -74,8 +78,14 @@ class _Finish:
             if self.best is not None:
                 self.best = with_present_settings(store, self.best)
             else:
+                lost = winner_in_best_alone(store)
                 with self._working("choosing the best policy") as say:
                     self.best = finish.choose_best(store, say=say)
+                if lost is not None:
+                    self.notes.append(
+                        f"The best policy of before, {lost.trial_id} at {lost.num_env_steps:,} env steps, could not "
+                        "compete, as its checkpoint is gone: best/ has another one now."
+                    )
             self.artifacts["policy"] = store.best_policy_path
         except TuneJobsError as error:
             self._why = error
@@ -136,6 +146,10 @@ class _Finish:
             self.notes.append(f"No {what}: {error}")
             # Other errors are expected, as not every environment can be drawn.
             self.failed = self.failed or isinstance(error, EnvFailedError)
+        except Exception as error:  # noqa: BLE001 (whatever a library raises that draws, what was trained is told)
+            _LOG.exception("%s: no %s", self._store.name, what)
+            self.notes.append(f"No {what}: {type(error).__name__}: {said_by(error)}.")
+            self.failed = True
 
     def _asked_to_stop(self) -> bool:
         # Another process may have asked to stop, which ends this too.

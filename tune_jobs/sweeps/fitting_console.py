@@ -5,6 +5,8 @@ Rich's `Text` keeps ESC, with which a text could write to the clipboard of whoev
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterable
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -20,3 +22,11 @@ class FittingConsole(Console):
         """Render an object into segments, of which those with a text are fitted."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=fit(segment.text))
+
+    def on_broken_pipe(self) -> None:
+        """Leave it to whoever prints whether a command fails because nobody reads it; rich would end the process.
+
+        Raises:
+            BrokenPipeError: Always.
+        """
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))

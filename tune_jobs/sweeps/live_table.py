@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Sequence
 
@@ -16,6 +17,7 @@ from analysis.selection import Selection
 from analysis.tables import shown_point
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
 from tune_jobs.sweeps.columns import fit
+from tune_jobs.sweeps.fitting_console import FittingConsole
 from tune_jobs.sweeps.monitor import Row, SweepMonitor
 
 STATUS_STYLES: dict[TrialStatus, str] = {
@@ -23,9 +25,10 @@ STATUS_STYLES: dict[TrialStatus, str] = {
     "pending": "dim",
 }  # fmt: skip
 _MAX_ROWS = 12
-_ROOM_FOR_OTHERS = 9
-"""Lines of a terminal that are not for trials: the facts above them, their titles, and what follows."""
+_ROOM_FOR_OTHERS = 3
+"""Lines of a terminal that are neither for trials nor above their table: its titles, and what follows."""
 _GAP = 2
+_STOPPING = "the running trials save a checkpoint. Ctrl-C again ends them now."
 _WAITS = "no trial runs: waiting for a node that has room for one"
 _MAX_MEASURED = 200
 _MAX_POINT = 300
@@ -58,16 +61,26 @@ def render(monitor: SweepMonitor, width: int = 120, height: int | None = None) -
         height: Lines of the terminal; None: any number.
     """
     monitor.look()
-    parts: list[RenderableType] = [_head(monitor, width), _facts(monitor)]
-    most = _MAX_ROWS if height is None else max(1, min(_MAX_ROWS, height - _ROOM_FOR_OTHERS))
+    parts: list[RenderableType] = [_head(monitor, width)]
+    if monitor.stopping:
+        # First, as the end is cut where a terminal is too low: who sees nothing presses Ctrl-C again.
+        parts.append(Text(f"Stopping: {_STOPPING}", "yellow"))
+    parts.append(_facts(monitor))
+    most = _MAX_ROWS
+    if height is not None:
+        most = max(1, min(most, height - _num_lines(Group(*parts), width) - _ROOM_FOR_OTHERS))
     rows, left_out = monitor.rows(most)
     if rows:
         parts.append(_trials(monitor, rows, width))
     if left_out:
         parts.append(Text(f"and {left_out:,} more running", "dim"))
-    if monitor.stopping:
-        parts.append(Text("Stopping: the running trials save a checkpoint. Ctrl-C again ends them now.", "yellow"))
     return Group(*parts)
+
+
+def _num_lines(what: RenderableType, width: int) -> int:
+    """Return how many lines something has on a terminal, where it is wrapped."""
+    console = FittingConsole(file=io.StringIO(), width=width)
+    return len(console.render_lines(what, pad=False))
 
 
 def _head(monitor: SweepMonitor, width: int) -> RenderableType:
@@ -112,7 +125,9 @@ def _facts(monitor: SweepMonitor) -> RenderableType:
 
 
 def _time_left(monitor: SweepMonitor) -> str:
-    if monitor.stopping or all(record.status in FINISHED for record in list(monitor.records.values())):
+    if monitor.stopping or monitor.is_over:
+        return ""
+    if all(record.status in FINISHED for record in list(monitor.records.values())):
         return ""
     seconds = monitor.progress().time_left_s
     if seconds is None:
@@ -196,7 +211,7 @@ def summary_line(monitor: SweepMonitor) -> str:
     monitor.look()
     elapsed = f"{monitor.title}: {duration(monitor.elapsed_s, tenths=False)}"
     if monitor.phase:
-        return f"{elapsed}; {monitor.phase}"
+        return f"{elapsed}; {monitor.phase}{'; stopping' if monitor.stopping else ''}"
     progress = monitor.progress()
     share = 100 * progress.num_env_steps // max(1, progress.max_env_steps)
     words = [
@@ -210,6 +225,8 @@ def summary_line(monitor: SweepMonitor) -> str:
     if best is not None:
         words.append(f"best {return_text(best.point_score)} ({best.trial.trial_id}: {describe_point(best.trial, 60)})")
     seconds = progress.time_left_s
-    if seconds:
+    if monitor.stopping:
+        words.append(f"stopping: {_STOPPING}")
+    elif seconds and not monitor.is_over:
         words.append(f"about {duration(seconds, tenths=False, none=PLAIN_NONE)} left")
     return "; ".join(words)

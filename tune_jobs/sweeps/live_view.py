@@ -25,6 +25,8 @@ from tune_jobs.sweeps.notebook_view import WIDTH, NotebookView, kernel_shell
 
 _REFRESH_PER_S = 4
 _LINE_INTERVAL_S = 10.0
+_LOOK_S = 0.5
+"""How soon a line tells what somebody waits for."""
 
 Say = Callable[[str], None]
 """Takes what is done now, such as "writing the report"."""
@@ -39,12 +41,20 @@ def share_terminal() -> None:
 
 
 class _Lines:
-    """Prints a line at regular intervals, and at the end if asked to."""
+    """Prints a line at regular intervals, once as soon as there is news, and at the end if asked to."""
 
-    def __init__(self, line: Callable[[], str], stream: IO[str], *, at_the_end: bool) -> None:
+    def __init__(
+        self,
+        line: Callable[[], str],
+        stream: IO[str],
+        *,
+        at_the_end: bool,
+        has_news: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._line = line
         self._stream = stream
         self._at_the_end = at_the_end
+        self._has_news = has_news
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -58,8 +68,13 @@ class _Lines:
             self._print()
 
     def _run(self) -> None:
-        while not self._over.wait(_LINE_INTERVAL_S):
-            self._print()
+        told_at, had_news = time.monotonic(), False
+        while not self._over.wait(min(_LOOK_S, _LINE_INTERVAL_S)):
+            has_news = self._has_news()
+            if has_news > had_news or time.monotonic() - told_at >= _LINE_INTERVAL_S:
+                told_at = time.monotonic()
+                self._print()
+            had_news = has_news
 
     def _print(self) -> None:
         print(fit(self._line()), file=self._stream, flush=True)
@@ -73,6 +88,17 @@ class _Screen:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield render(self._monitor, options.max_width, console.height)
+
+
+class _Drawing(Live):
+    """Hides the cursor only while it draws: Ctrl-Z and a kill leave the terminal as it is, and a shell needs one."""
+
+    def refresh(self) -> None:
+        """Draw anew, in one piece with the controls around it."""
+        with self._lock, self.console:
+            self.console.show_cursor(False)  # noqa: FBT003 (rich's signature)
+            super().refresh()
+            self.console.show_cursor(True)  # noqa: FBT003
 
 
 @contextlib.contextmanager
@@ -93,16 +119,27 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
             if progress != "none":
                 stack.enter_context(_view(monitor, stream))
             # What is left on the screen afterwards is the result.
-            stack.callback(setattr, monitor, "phase", "")
+            stack.callback(monitor.end)
             yield
 
 
 def _view(monitor: SweepMonitor, stream: IO[str]) -> AbstractContextManager[object]:
     if kernel_shell() is not None:
         return NotebookView(monitor.name, lambda: render(monitor, WIDTH), is_line=False)
-    if stream.isatty() and not _shares_terminal:
-        return Live(_Screen(monitor), console=FittingConsole(file=stream), refresh_per_second=_REFRESH_PER_S)
-    return _Lines(lambda: summary_line(monitor), stream, at_the_end=True)
+    console = FittingConsole(file=stream)
+    if _can_redraw(stream, console):
+        # Rich would take what is printed meanwhile to the terminal, and it is for the log.
+        return _Drawing(
+            _Screen(monitor), console=console, refresh_per_second=_REFRESH_PER_S, redirect_stdout=False,
+            redirect_stderr=False,
+        )  # fmt: skip
+    return _Lines(lambda: summary_line(monitor), stream, at_the_end=True, has_news=lambda: monitor.stopping)
+
+
+def _can_redraw(stream: IO[str], console: Console) -> bool:
+    """Whether a table can be drawn again and again; where rich doesn't think so, it draws none until the end."""
+    is_able = console.is_terminal and console.is_interactive and not console.is_dumb_terminal
+    return stream.isatty() and is_able and not _shares_terminal
 
 
 @contextlib.contextmanager
@@ -138,8 +175,9 @@ def working(name: str, what: str, progress: str) -> Iterator[Say]:
         return
     # Unlike `shown`, this leaves the streams alone: warnings of libraries are seen.
     with patient_stream() as stream:
-        if stream.isatty() and not _shares_terminal:
-            with Live(spinner, console=FittingConsole(file=stream), refresh_per_second=_REFRESH_PER_S, transient=True):
+        console = FittingConsole(file=stream)
+        if _can_redraw(stream, console):
+            with _Drawing(spinner, console=console, refresh_per_second=_REFRESH_PER_S, transient=True):
                 yield say
         else:
             with _Lines(line, stream, at_the_end=False):

@@ -54,6 +54,9 @@ class SweepMonitor:
         self.name = name
         self.records: dict[str, TrialRecord] = {record.trial_id: record for record in records}
         self.stopping = False
+        """Whether somebody has asked the trials to stop."""
+        self.is_over = False
+        """Whether nothing follows any more: neither what is done now nor how long it takes is told."""
         self.stage = ""
         self.phase = ""
         """What is done before the trials train or after they have, such as "starting Ray"; empty while they do."""
@@ -107,7 +110,7 @@ class SweepMonitor:
     @property
     def waits(self) -> bool:
         """Whether trials are left and none has run for a while: no node has room for one, or none is there."""
-        if self.phase or self.stopping or self._clock() - self._idle_since < _IDLE_S:
+        if self.phase or self.stopping or self.is_over or self._clock() - self._idle_since < _IDLE_S:
             return False
         statuses = {record.status for record in list(self.records.values())}
         return "running" not in statuses and not statuses <= FINISHED
@@ -117,6 +120,10 @@ class SweepMonitor:
         records = list(self.records.values())
         # Of ten thousand trials that report, a look at each would be for nothing.
         return forecast([self._as_reached(record) for record in records] if self._within else records, self._caps)
+
+    def end(self) -> None:
+        """Tell only what came of it from now on."""
+        self.phase, self.stopping, self.is_over = "", False, True
 
     def look(self) -> None:
         """Look how far the trials are if none has reported for a while: an iteration of a slow env takes minutes."""

@@ -157,6 +157,9 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
 
     Checkpoints of the rllib engine are pickles: restore only sweeps you trust.
 
+    RLlib needs a Ray. Where this process has joined none, one of this machine is started, which runs until
+    `ray.shutdown()` or the end of the process; a sweep that is launched meanwhile runs in it.
+
     Args:
         source: A sweep (its best checkpoint), `SWEEP/TRIAL` (the trial's best), or a checkpoint folder.
         storage: Folder for sweeps.
@@ -164,10 +167,16 @@ def restore(source: str | Path, *, storage: str | Path | None = None) -> Algorit
     Raises:
         NotFoundError: There is no such checkpoint.
         CheckpointError: It is damaged, of a baseline, or cannot be restored with exactly the weights that were saved.
+        CannotRunError: Ray cannot be started here.
     """
+    from tune_jobs.plan.machine import local_machine
     from tune_jobs.sweeps.conclude import find_trained_checkpoint
     from tune_jobs.training.registry import restore_checkpoint
 
     folder, engine = find_trained_checkpoint(source, storage)
-    algorithm: Algorithm = restore_checkpoint(folder, engine)
+    # Imports Ray, which a wrong name needs not wait for.
+    from tune_jobs.ray_tune.cluster import left_running
+
+    with left_running(local_machine()):
+        algorithm: Algorithm = restore_checkpoint(folder, engine)
     return algorithm

@@ -36,6 +36,7 @@ from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.candidates import leave_out, read_trials
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.transitions import with_checkpoints
+from tune_jobs.sweeps.current_best import winner_in_best_alone
 from tune_jobs.sweeps.forecast import caps_of
 
 MOST_CANDIDATES = 16
@@ -227,13 +228,16 @@ def confirmed_best(store: Sweep) -> BestRecord | None:
     """Return the winner that was confirmed before.
 
     Returns:
-        None: it is missing or damaged, or it would be chosen among other candidates now.
+        None: it is missing or damaged, or it would be chosen among other candidates now. Where all checkpoints were
+            deleted, there are none, and it stays.
     """
     try:
         best = store.read_best()
         read_policy(store.best_folder)
-        store.trial(best.checkpoint.trial_id).verify_checkpoint(best.checkpoint.iteration)
         trials = read_trials(store)
+        if not policy_candidates(trials) and winner_in_best_alone(store) is not None:
+            return best
+        store.trial(best.checkpoint.trial_id).verify_checkpoint(best.checkpoint.iteration)
         budget = most_env_steps(stored_spec(store.read_record()), trials)
     except TuneJobsError:
         return None

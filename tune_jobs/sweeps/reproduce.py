@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -34,7 +36,8 @@ from tune_jobs.store.logs import continued_from
 from tune_jobs.store.opening import open_sweep
 from tune_jobs.store.transitions import pending_record
 from tune_jobs.sweeps.alone import run_alone
-from tune_jobs.sweeps.drive import git_commit, machine_here, settled
+from tune_jobs.sweeps.changed_code import git_commit
+from tune_jobs.sweeps.drive import machine_here, settled
 from tune_jobs.sweeps.outcome import Progress, SweepResult
 from tune_jobs.sweeps.repeating import plan_of_repetition
 from tune_jobs.sweeps.sources import find_source, find_trial
@@ -88,13 +91,15 @@ def reproduce(
     recorded = store.trial(trial.trial_id).read_iterations()
     _check(store, trial, spec, recorded)
     repeatable = _repeatable(store, trial, recorded)
+    # Read now: while the repetition trains, the trial may go on, and write the iterations after its checkpoint anew.
+    ours = _Ours(trial, sweep, recorded, repeatable, _weights_by_iteration(store, trial, repeatable))
     where, is_kept = _folder(output, store.name)
     again = open_sweep(where)
     again.create()
     try:
         _write(again, sweep, spec, trial, repeatable[-1].iteration if repeatable else 1)
         _train_again(again.place, progress)
-        return _compared(store, again, trial, len(repeatable), is_kept=is_kept)
+        return _compared(store, again, ours, folder_at(again.place) if is_kept else None)
     except BaseException:
         # What has trained is there to be looked at; anything else would be in the way of the next try.
         if is_kept and not _has_begun(again, trial.trial_id):
@@ -186,23 +191,33 @@ def _train_again(place: str, progress: str) -> SweepResult:
         return run_sweep(store, plan, address=None, machine=machine, finish=False, progress=progress)
 
 
-def _compared(store: Sweep, again: Sweep, trial: TrialRecord, num_repeatable: int, *, is_kept: bool) -> Repetition:
-    recorded, sweep = store.trial(trial.trial_id).read_iterations(), store.read_record()
-    repeatable = recorded[:num_repeatable]
+@dataclass(frozen=True)
+class _Ours:
+    """A trial as it was recorded when its repetition began."""
+
+    trial: TrialRecord
+    sweep: SweepRecord
+    recorded: Sequence[IterationRecord]
+    repeatable: Sequence[IterationRecord]
+    weights: Mapping[int, str | None]
+    """The digests of its checkpoints' weights, by iteration."""
+
+
+def _compared(store: Sweep, again: Sweep, ours: _Ours, kept_in: Path | None) -> Repetition:
+    trial, recorded, repeatable = ours.trial, ours.recorded, ours.repeatable
     (repeated,) = again.read_trials()
     # The last recorded iteration of a trial that a scheduler or a signal ended may lie between two evaluations.
     ended = trial.status not in ("completed", "failed") or len(repeatable) < len(recorded)
     difference = first_difference(repeatable, again.trial(trial.trial_id).read_iterations(), may_lack_evaluation=ended)
     last = repeatable[-1].iteration if difference is None and repeatable else 0
     same = [
-        _weights(store, ours) == _weights(again, theirs)
-        for ours in trial.checkpoints
+        ours.weights[theirs.iteration] == _weights(again, theirs)
         for theirs in repeated.checkpoints
-        if ours.iteration == theirs.iteration <= last
+        if theirs.iteration in ours.weights and theirs.iteration <= last
     ]
-    known = trial.ran_with or sweep.versions
+    known = trial.ran_with or ours.sweep.versions
     changed = list(causes(known, repeated.ran_with or versions()))
-    commits = (sweep.git_commit, again.read_record().git_commit)
+    commits = (ours.sweep.git_commit, again.read_record().git_commit)
     if commits[0] != commits[1]:
         changed.append(Changed("git commit", *(commit or "none" for commit in commits)))
     return Repetition(
@@ -216,8 +231,20 @@ def _compared(store: Sweep, again: Sweep, trial: TrialRecord, num_repeatable: in
         causes=tuple(changed),
         notes=tuple(_notes(store, again, trial, repeated, len(recorded) - len(repeatable), is_known="cpu" in known)),
         knows_cpu="cpu" in known,
-        folder=folder_at(again.place) if is_kept else None,
+        folder=kept_in,
     )
+
+
+def _weights_by_iteration(
+    store: Sweep, trial: TrialRecord, repeatable: Sequence[IterationRecord]
+) -> dict[int, str | None]:
+    found = {}
+    for item in trial.checkpoints:
+        if repeatable and item.iteration <= repeatable[-1].iteration:
+            # One that is gone is not compared.
+            with contextlib.suppress(NotFoundError):
+                found[item.iteration] = _weights(store, item)
+    return found
 
 
 def _weights(store: Sweep, checkpoint: CheckpointRecord) -> str | None:

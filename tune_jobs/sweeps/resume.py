@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ParamSpec
 
-from analysis.records import FINISHED, FORMAT_VERSION, ReplicationRecord
+from analysis.records import FINISHED, FORMAT_VERSION, ReplicationRecord, SweepRecord
 from policies.envs.modules import allow_modules
 from policies.guard.guard import guarding
 from tune_jobs.plan.machine import Machine
@@ -17,6 +17,7 @@ from tune_jobs.spec.rules import check_extendable, check_replicable
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
+from tune_jobs.sweeps.changed_code import notes_on_commit
 from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.own_job import note_own_job
@@ -121,7 +122,8 @@ def _taken_over(
 ) -> Iterator[tuple[Machine | None, Machine, tuple[str, ...]]]:
     """Hold the sweep's lock for the block; `more` trials than those that are not finished may come to the sweep in it.
 
-    It gives the machine to start Ray on, if any, what the sweep runs on, and notes on its nodes and on its version.
+    It gives the machine to start Ray on, if any, what the sweep runs on, and notes on its nodes and on the versions
+    of a user's own code and of this one.
     """
     check_wait(address, wait_for_nodes)
     with contextlib.ExitStack() as stack:
@@ -140,7 +142,7 @@ def _taken_over(
             note_wait(store, None)
             if more or any(trial.status not in FINISHED for trial in store.read_trials()):
                 stack.enter_context(packs_begun_ahead(stored_spec(store.read_record()), machine))
-            yield machine, machine, _notes_on_version(store)
+            yield machine, machine, _notes_on_versions(store.read_record())
             return
         connection = stack.enter_context(connected(address, None))
         from tune_jobs.ray_tune.node_checks import check_nodes
@@ -149,12 +151,16 @@ def _taken_over(
         record = store.read_record()
         num_gpus = stored_spec(record).resources.num_gpus
         notes = check_nodes(store.place, record.allowed_modules, num_gpus=num_gpus)
-        yield None, found, (*notes, *_notes_on_version(store))
+        yield None, found, (*notes, *_notes_on_versions(record))
 
 
-def _notes_on_version(store: Sweep) -> tuple[str, ...]:
+def _notes_on_versions(record: SweepRecord) -> tuple[str, ...]:
+    """Return notes on a sweep that was begun with other code than there is here."""
+    return (*_notes_on_version(record), *notes_on_commit(record))
+
+
+def _notes_on_version(record: SweepRecord) -> tuple[str, ...]:
     """Return the note on a sweep that another version of tune-jobs began; empty if it was this one, or is not known."""
-    record = store.read_record()
     began, here = (found.get("tune-jobs") for found in (record.versions, versions()))
     # What is got from a repository may have the number of the last release.
     is_earlier = record.format_version < FORMAT_VERSION

@@ -58,6 +58,8 @@ def engine_of_checkpoint(checkpoint: Path) -> Engine:
 def restore_checkpoint(checkpoint: Path, engine: Engine) -> Any:
     """Restore a checkpoint as an RLlib `Algorithm` that can continue training.
 
+    What this process draws at random elsewhere is as it would have been without.
+
     Args:
         checkpoint: Its folder; callers check the manifest's hashes first.
         engine: Its engine, which must be able to restore.
@@ -65,8 +67,14 @@ def restore_checkpoint(checkpoint: Path, engine: Engine) -> Any:
     Raises:
         CheckpointError: It cannot be restored with exactly the weights that were saved.
     """
+    # Not needed to train.
+    from tune_jobs.process.state import randomness_given_back
+
     assert engine.restore is not None
-    return _loaded(engine.restore)(checkpoint)
+    restore = _loaded(engine.restore)
+    # From here on, as torch is loaded with it.
+    with randomness_given_back():
+        return restore(checkpoint)
 
 
 def _loaded(path: str) -> Any:

@@ -56,7 +56,7 @@ def algorithm_from_checkpoint(checkpoint: Path) -> RLlibAlgorithm:
 
 
 def _num_cpus() -> float:
-    """Return the CPUs of the Ray that this process has joined, or of this machine, where RLlib will start one."""
+    """Return the CPUs of the Ray that this process has joined, or of this machine if it has joined none."""
     return float(ray.cluster_resources().get("CPU", 0.0)) if ray.is_initialized() else usable_cpus()
 
 

@@ -241,7 +241,8 @@ def _trace(
     drawn = [] if num_masked(env.observation_space) else [sample(env, space, None) for _ in range(_TIMED_STEPS)]
     deadline = time.perf_counter() + seconds
     # An error of the env is reported by the trial that it happens in.
-    with contextlib.suppress(Exception), contextlib.closing(env):
+    with contextlib.suppress(Exception), contextlib.ExitStack() as stack:
+        stack.callback(close_env, env)
         now = np.array(env.reset(seed=seed)[0])
         yield _Seen(0, now)
         for num_steps in range(1, _TIMED_STEPS + 1):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policies.envs.failures import FailureRule
+from policies.envs.faults import close_env
 from policies.envs.make import make_vector_env
 from policies.envs.wrappers import FailurePenalty
 
@@ -31,7 +32,7 @@ class Penalty:
         if reward is None:
             return None
         env = make_vector_env(env_id, env_args, 1, failure_penalty=reward)
-        env.close()
+        close_env(env)
         assert isinstance(env, FailurePenalty)
         return cls(env.rule, env.penalty)
 

@@ -13,6 +13,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
+from policies.answers import wait_for_answer
 from policies.child_processes import entry, how_it_ended
 from policies.envs.faults import note_signals
 from policies.envs.modules import allow_modules, allowed_modules
@@ -58,6 +59,7 @@ class ProcessHost:
     def receive(self) -> Any:
         """Wait for the result of the last call and return it, or raise its error."""
         try:
+            wait_for_answer(self._connection, lambda: not self._process.is_alive())
             answer = self._connection.recv()
         except (EOFError, OSError) as error:
             raise self._died() from error
@@ -96,6 +98,8 @@ def serve(
     """Answer a `ProcessHost` until it closes; if its process ends, this one ends too, even inside a step."""
     pid, by_kernel = parent
     end_with_parent(parent=pid, by_kernel=by_kernel)
+    # Daemons may have no processes, and an environment may. The parent, which holds this one for one, ends it as such.
+    multiprocessing.current_process().daemon = False
     # Ctrl-C in a terminal reaches this process too, but the parent decides when it ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     note_signals()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from tune_jobs.store.objects.scratch import filling, make_local, write_local
 from tune_jobs.store.record_files import dump_sealed
 
 
-class Artifacts:
+class Artifacts(ABC):
     """What a sweep has come to; the part of `ObjectSweep` that has it.
 
     Args:
@@ -37,6 +38,14 @@ class Artifacts:
     def __init__(self, parts: Parts) -> None:
         self._parts = parts
         self._bucket = parts.bucket
+
+    @abstractmethod
+    def check_not_removed(self) -> None:
+        """Check that the sweep is one still, before anything is written of it.
+
+        Raises:
+            NotFoundError: It was removed.
+        """
 
     def _shared(self, folder: str, *, fetched: bool = True) -> Path:
         """Return the local folder of the winner or the report, with what the store has of it."""
@@ -100,6 +109,7 @@ class Artifacts:
 
     def write_best(self, record: BestRecord, policy: PortablePolicy | None = None) -> None:
         """Replace the winner; the sealed record is written after the policy."""
+        self.check_not_removed()
         if policy is not None:
             made = self._parts.own() / "made" / names.BEST_FOLDER
             save_policy(policy, made)
@@ -145,6 +155,7 @@ class Artifacts:
         self._parts.remove_record(f"{names.BEST_FOLDER}/{names.FILMS_RECORD}")
         paths = {film: made / name for film, name in names.FILMS.items()}
         yield paths
+        self.check_not_removed()
         self._upload(names.BEST_FOLDER, made, [path for path in paths.values() if path.is_file()])
         self._write_record(names.FILMS_RECORD, FilmsRecord(checkpoint=shown))
 
@@ -175,6 +186,7 @@ class Artifacts:
         with filling():
             shutil.copytree(present, folder, ignore=shutil.ignore_patterns(".*"))
         yield folder
+        self.check_not_removed()
         files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
         page = folder / names.REPORT_PAGE
         self._upload(names.REPORT_FOLDER, folder, [path for path in files if path != page])

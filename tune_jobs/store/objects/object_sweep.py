@@ -36,6 +36,7 @@ from tune_jobs.store.objects.probe import FOLDER as PROBE_FOLDER
 from tune_jobs.store.objects.probe import ObjectProbe, probing
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.places import is_trial_id
+from tune_jobs.store.removal import removed_meanwhile
 
 _LOCK, _DRIVER_LOCK = "lock.json", "driver-lock.json"
 _CLAIM, _STOP = "claim", "stop"
@@ -86,6 +87,11 @@ class ObjectSweep(Artifacts):
         """Whether the sweep exists."""
         ours = held(self.url)
         return (ours is not None and ours.found(names.SWEEP_RECORD) is not None) or bool(self.record_stamp())
+
+    def check_not_removed(self) -> None:
+        """Check that there is anything of it still: its record, or the claim of its name before that."""
+        if not self.exists() and self._bucket.look(_CLAIM) is None:
+            raise removed_meanwhile(self.name)
 
     def create(self) -> None:
         """Take the name; of several processes that want it at once, one gets it.
