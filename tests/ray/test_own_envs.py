@@ -171,7 +171,7 @@ def test_an_env_id_of_an_allowed_module_trains_in_env_runners_too_and_goes_on_wi
     # Another process knows only what sweep.json says.
     env_modules._allowed.clear()
     record, _ = sweeps.evaluate("own", storage=tmp_path, num_episodes=4)
-    assert (record.env_id, record.threshold) == (f"{OWN}:TestEdge", 11.5)
+    assert (record.env_id, record.threshold) == (f"{OWN}:TestEdge-v0", 11.5)
     env_modules._allowed.clear()
     assert {path.name for path in sweeps.video("own", storage=tmp_path).values()} >= {"after.mp4"}
     env_modules._allowed.clear()
