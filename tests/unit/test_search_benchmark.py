@@ -223,6 +223,15 @@ def test_a_method_with_few_runs_of_a_task_takes_that_from_no_others() -> None:
     ]  # fmt: skip
 
 
+def test_methods_that_have_run_all_tasks_are_ranked_where_each_task_has_one_more() -> None:
+    found = {(task, name): kept(1, 2) for task in ("cartpole-dqn", "acrobot-dqn") for name in ("random", "tpe", "pbt")}
+    found |= {("cartpole-dqn", "asha"): kept(1, 2), ("acrobot-dqn", "pb2"): kept(1, 2)}
+    assert [line.partition(",")[0] for line in tables(found) if line.startswith("Mean rank")] == [
+        "Mean rank of 2 over 2 tasks", "Mean rank of 3 over 2 tasks", "Mean rank of 4 over 1 task",
+        "Mean rank of 4 over 1 task",
+    ]  # fmt: skip
+
+
 def test_the_default_is_ranked_beside_random_draws_wherever_both_were_run() -> None:
     found = {("cartpole-dqn", "random"): kept(1, 2), ("cartpole-dqn", "gp"): kept(5, 1)}
     text = "\n".join(tables({**found, ("acrobot-dqn", "gp"): kept(5, 5), ("acrobot-dqn", "tpe"): kept(5, 5)}))

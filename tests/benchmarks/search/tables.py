@@ -39,7 +39,8 @@ def tables(kept: Kept) -> Iterator[str]:
     often = [_most_often(kept, task, methods) for task in tasks]
     choosing = [method for method in methods if method in METHODS]
     default = [method for method in methods if method in ("random", AUTO_SEARCH)]
-    for some in dict.fromkeys(map(tuple, (default, choosing, *sorted(often, key=len), methods))):
+    everywhere = [method for method in methods if all(method in some for some in often)]
+    for some in dict.fromkeys(map(tuple, (default, choosing, everywhere, *sorted(often, key=len), methods))):
         yield from _ranks(kept, tasks, some)
     for named in dict.fromkeys(((*default, *confirmed), (*methods, *confirmed)) if confirmed else ()):
         yield from _ranks(kept, tasks, named, {"test": "on test seeds"})
