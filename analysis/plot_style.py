@@ -45,6 +45,8 @@ _MAX_GROUP_VALUES = len(PALETTE)
 MAX_DRAWN = 1e100
 _DPI_OF_SVG = 72
 _FONTS = ("font.", "mathtext.", "text.latex.", "text.usetex")
+_OF_THE_PROCESS = ("backend", "date.epoch", "interactive", "tk.", "toolbar", "webagg.")
+"""Settings of matplotlib that no figure is drawn by."""
 _styled = threading.RLock()
 """Held by the thread that has changed matplotlib's settings, which are the process's."""
 _CSS_NAMES = {INK: "ink", MUTED: "muted", GRID: "grid", ACCENT: "accent"} | {
@@ -160,14 +162,16 @@ def own_style(*, fonts: bool = True) -> Iterator[None]:
         fonts: Whether this is so of fonts, too, and of TeX, which may not be there; of a paper's they are the caller's.
     """
     import matplotlib as mpl
-    from matplotlib import style
 
+    left = _OF_THE_PROCESS if fonts else _OF_THE_PROCESS + _FONTS
     with _styled:
-        kept: dict[str, Any] = {}
-        if not fonts:
-            # Not by `items`: to ask for the backend loads it.
-            kept = {name: mpl.rcParams[name] for name in mpl.rcParams if name.startswith(_FONTS)}
-        with style.context(["default", kept]):
+        # As dicts: to ask for the backend loads it. Not by `matplotlib.style`, which reads all styles as it is loaded.
+        changes = {
+            name: value
+            for name, value in dict.items(mpl.rcParamsDefault)
+            if dict.get(mpl.rcParams, name) != value and not name.startswith(left)
+        }
+        with mpl.rc_context(changes):
             yield
 
 

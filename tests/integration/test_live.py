@@ -17,6 +17,7 @@ from fake_engine import FakeClock
 from rich.console import Console
 from test_monitor import make_monitor, make_trial
 
+from tests.terminals import read_to_the_end
 from tune_jobs.sweeps import live_table as live
 from tune_jobs.sweeps import live_view
 from tune_jobs.sweeps.monitor import SweepMonitor
@@ -311,10 +312,7 @@ def test_on_a_terminal_finishing_is_shown_and_leaves_nothing() -> None:
             seen += os.read(ours, 1_000)
         assert process.stdin is not None
         process.stdin.close()
-        rest = b""
-        with contextlib.suppress(OSError):  # the terminal's end, on Linux
-            while more := os.read(ours, 1_000):
-                rest += more
+        rest = read_to_the_end(ours)
     os.close(ours)
     assert process.returncode == 0
     # The line is deleted at the end, and the cursor is shown again.
@@ -347,9 +345,7 @@ def test_what_finishing_does_now_takes_the_place_of_what_it_did(*, on_terminal: 
         while b"mine: confirming the best policy: episode 3 of 100" not in seen and time.monotonic() < until:
             seen += os.read(ours, 1_000)
         process.stdin.close()
-        with contextlib.suppress(OSError):  # the terminal's end, on Linux
-            while more := os.read(ours, 1_000):
-                seen += more
+        seen += read_to_the_end(ours)
     os.close(ours)
     assert process.returncode == 0
     assert -1 < seen.rfind(b"choosing") < seen.find(b"confirming")

@@ -1,6 +1,5 @@
 """What is on a terminal while a sweep runs: of any height, one that can't redraw, and when Ctrl-C has come."""
 
-import contextlib
 import io
 import os
 import pty
@@ -16,6 +15,7 @@ import test_monitor
 from rich.console import Console
 from test_monitor import make_monitor, make_trial
 
+from tests.terminals import read_to_the_end
 from tune_jobs.sweeps import live_table, live_view
 from tune_jobs.sweeps.monitor import SweepMonitor
 
@@ -119,10 +119,7 @@ def rest(process: subprocess.Popen[bytes], terminal: int) -> bytes:
     """What is on the terminal until the process has ended."""
     assert process.stdin is not None
     process.stdin.close()
-    seen = b""
-    with contextlib.suppress(OSError):  # the terminal's end, on Linux
-        while more := os.read(terminal, 1_000):
-            seen += more
+    seen = read_to_the_end(terminal)
     os.close(terminal)
     assert process.wait(60) == 0
     return seen

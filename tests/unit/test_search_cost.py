@@ -8,10 +8,11 @@ import pytest
 import scipy.optimize  # noqa: F401 - brings a BLAS of its own, which gp loads when it first computes
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from analysis.records import TrialRecord
+from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
 from tune_jobs.search import bandit, gp, history
 from tune_jobs.search.bandit import Gain, Next
 from tune_jobs.search.history import History, KnownPoint, known_points
+from tune_jobs.search.prior import with_prior
 from tune_jobs.search.proposal import next_point
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -133,3 +134,21 @@ def test_pb2_computes_with_one_thread(two_threads: None, monkeypatch: pytest.Mon
     bandit.propose(Next(5.0, 0.0, {"lr": 1e-3}, ()), spec.space, gains, np.random.default_rng(0), 0.25)
     assert seen == [{1}]
     assert num_threads() == {2}
+
+
+def test_own_scores_are_not_looked_at_anew_for_each_point_of_an_earlier_sweep() -> None:
+    looks = 0
+
+    class Counted(KnownPoint):
+        @property
+        def score(self) -> float | None:
+            nonlocal looks
+            looks += 1
+            return self.scores[0]
+
+    own = [Counted({"lr": 1e-3}, (None if at % 5 == 0 else float(at),)) for at in range(50)]
+    points = tuple(PriorPointRecord(point={"lr": 1e-3}, share=at / 400) for at in range(400))
+    told = with_prior(own, [PriorRecord(sweep="first", env_id="Acrobot-v1", points=points)])
+    assert len(told) == 450
+    # Between two own ones each point is told of both, a few times.
+    assert looks < 10 * len(own) + 8 * len(points)

@@ -173,23 +173,24 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
     ended = [point for point in known if not point.is_running]
     if sum(point.level is None and point.score is not None for point in ended) >= _ENOUGH:
         ordered = sorted(ended, key=rank_of)
-        return [*(_like_own(item, ordered) for item in earlier), *known]
+        num_failed = sum(point.score is None for point in ended)
+        return [*(_like_own(item, ordered, num_failed) for item in earlier), *known]
     shares = iter(map(float, shares_of(ended)))
     own = [point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known]
     return [*(KnownPoint(item.point, (item.share,), is_own=False) for item in earlier), *own]
 
 
-def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint]) -> KnownPoint:
+def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint], num_failed: int) -> KnownPoint:
     """Return an earlier sweep's point with what the own point of its rank reached; if that failed, the worst's score.
 
     Args:
         item: The point.
         ordered: The own points that ended, the worst first: those that failed, and some that have a score. What failed
             counts here as it did for the share.
+        num_failed: How many of them failed.
     """
     if item.share is None:
         return KnownPoint(item.point, (None,), is_own=False)
-    num_failed = sum(point.score is None for point in ordered)
     place = max(item.share * (len(ordered) - 1), num_failed)
     worse, better = ordered[math.floor(place)], ordered[math.ceil(place)]
     part = place - math.floor(place)

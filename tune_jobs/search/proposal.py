@@ -121,8 +121,9 @@ def propose_point(
     """
     known = (history or History(spec)).known_points(records)
     # Where all scores are equal nothing was learnt, and of trainings that learn nothing the shortest is no find.
-    is_told_by_cost = TRAINING_LENGTH in spec.space and _are_all_equal(with_prior(known, prior))
-    if spec.objective.cost is not None and not is_told_by_cost:
+    if spec.objective.cost is not None and not (
+        TRAINING_LENGTH in spec.space and _are_all_equal(with_prior(known, prior))
+    ):
         known = weighed(known, drawn_index, spec.seed)
         prior = [weighed_prior(each, drawn_index, spec.seed) for each in prior]
     return next_point(

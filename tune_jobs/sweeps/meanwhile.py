@@ -32,7 +32,10 @@ def write_unless_outdated(store: Sweep, sweep: SweepRecord, best: BestRecord, po
         CannotRunError: It cannot be written.
     """
     check_same(store, sweep)
-    return _newer(store, best) or _written(store, best, policy)
+    if (newer := _newer(store, best)) is not None:
+        return newer
+    store.write_best(best, policy)
+    return best
 
 
 def check_same(store: Sweep, sweep: SweepRecord) -> None:
@@ -55,8 +58,3 @@ def _newer(store: Sweep, best: BestRecord) -> BestRecord | None:
         return None
     trials = readable_trials(store)
     return stored if is_outdated(store, best, trials) and not is_outdated(store, stored, trials) else None
-
-
-def _written(store: Sweep, best: BestRecord, policy: PortablePolicy) -> BestRecord:
-    store.write_best(best, policy)
-    return best

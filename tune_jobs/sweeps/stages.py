@@ -140,10 +140,10 @@ def _what_is_left_out(store: Sweep) -> tuple[str, ...]:
     except TuneJobsError:
         # Who wants them is told what is wrong.
         return ()
-    command = resume_command(store, store.read_record())
-    settings = len(set(wanted))
-    told = f"the {settings} leading settings got no more seeds (confirm), as nothing was to follow the trials"
-    return (f"{told}: `{command}` does both.",) if wanted else ()
+    if not wanted:
+        return ()
+    told = f"the {len(set(wanted))} leading settings got no more seeds (confirm), as nothing was to follow the trials"
+    return (f"{told}: `{resume_command(store, store.read_record())}` does both.",)
 
 
 def _round_of_confirm(store: Sweep) -> ReplicationRecord | None:
