@@ -43,8 +43,8 @@ ELSEWHERE = {
     "tensorflow", "forward_exploration",
     # Python
     "Loader", "MetaPathFinder",
-    # uv and systemd
-    "uv", "MemoryMax", "CPUQuota",
+    # uv, systemd and Slurm
+    "uv", "MemoryMax", "CPUQuota", "scancel",
     # a user's own, and a user's mistakes
     "Net", "maze", "my_nets", "my_plots", "plot_all", "epochs",
     # parts of file names, colours and commands

@@ -23,6 +23,7 @@ from policies.envs.modules import module_folders
 from policies.errors import CannotRunError
 from policies.parents import this_process
 from tune_jobs.plan.engine_choice import PackPlan
+from tune_jobs.process.clock import passing_s
 from tune_jobs.process.interruption import EXIT_CODE, current, last_words
 from tune_jobs.process.ran_with import versions
 from tune_jobs.ray_tune.connected_ray import is_of_a_sweep
@@ -156,6 +157,7 @@ class _Run:
         self._watch = watch
         self._store = self.store = store
         self._record = store.read_record()
+        self._began_s = passing_s()
         # The settings of every process: its sweep, its run, the driver with which it ends, and what its node must have.
         self._config: dict[str, Any] = {"sweep_place": store.place, "run": owner.token, "driver": this_process()}
         if self._record.address is not None:
@@ -169,6 +171,10 @@ class _Run:
         self.waits = RunWaits(store, self.keeper)
         self._scheduler: TrialScheduler = TuneScheduler(EveryoneGoesOn())
         self._chooser: PointChooser | None = None
+
+    def time_s(self) -> float:
+        """Return how long the sweep has been run, by this run and all before it."""
+        return self._record.run_time_s + passing_s() - self._began_s
 
     def all_trials(self) -> None:
         """Run all trials: those of the search first, then the further seeds of some of its points."""
@@ -355,6 +361,6 @@ def _give_up(run: _Run, watch: RayWatch, go_on: str, death: RayDiedError) -> Non
 
     run.keeper.close()
     if watch.hurries():
-        end_process(run.store, last_words(go_on), EXIT_CODE)
+        end_process(run.store, last_words(go_on), EXIT_CODE, run.time_s())
     error = ray_died(go_on, death)
-    end_process(run.store, f"error: {error}", error.exit_code)
+    end_process(run.store, f"error: {error}", error.exit_code, run.time_s())

@@ -250,7 +250,10 @@ def run_trials_of(
         else:
             shared.monitor.begin_stage(told, trials, caps)
         try:
-            _run_trials(store, plan, todo, shared, run, address=address, machine=machine, progress=progress)
+            _run_trials(
+                store, plan, todo, shared, run, address=address, machine=machine, progress=progress,
+                ran_s=record.run_time_s,
+            )  # fmt: skip
         finally:
             run.release()
         close_if_open(store)
@@ -272,6 +275,7 @@ def _run_trials(
     address: str | None,
     machine: Machine | None,
     progress: str,
+    ran_s: float,
 ) -> None:
     from tune_jobs.sweeps.live_view import shown
 
@@ -329,7 +333,7 @@ def _run_trials(
                 monitor.phase = "ending Ray" if address is None else "leaving the Ray cluster"
                 # Done before Ray is shut down: if a part of Ray died, that takes long, and may end this process.
                 with current().shielded(), run.held(), _giving_way_to(sys.exception()):
-                    close_run(store, passing_s() - began_s)
+                    close_run(store, ran_s + passing_s() - began_s)
 
 
 @contextlib.contextmanager
