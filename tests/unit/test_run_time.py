@@ -12,6 +12,7 @@ from tests.narrowing import present
 from tune_jobs.plan.sweep_plan import make_plan
 from tune_jobs.ray_tune import run_trials
 from tune_jobs.spec.file import stored_spec
+from tune_jobs.store.closing import close_run
 from tune_jobs.sweeps.drive import Shared, run_trials_of
 
 
@@ -40,3 +41,11 @@ def test_a_clock_that_is_set_back_takes_nothing_from_the_run_time(
     record = store.read_record()
     assert 100.05 <= record.run_time_s < 160.0
     assert (record.state, present(record.ended_at) < now() - 1000.0) == ("completed", True)
+
+
+def test_a_run_that_two_processes_close_counts_once(tmp_path: Path) -> None:
+    """The driver on a cluster, whose Ray has died, and the process that waited for it."""
+    store = make_sweep_folder(tmp_path / "mine")
+    for run_time_s in (30.0, 31.0, 30.5, 0.0):
+        close_run(store, run_time_s)
+    assert store.read_record().run_time_s == 31.0

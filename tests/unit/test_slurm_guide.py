@@ -13,13 +13,16 @@ ONE, SEVERAL = (block for block in GUIDE.read_text().split("```\n") if block.sta
 JOB = {"SLURM_JOB_ID": "17", "SLURM_NNODES": "4", "SLURM_CPUS_PER_TASK": "16", "SLURM_GPUS_ON_NODE": "2"}
 ADDRESS = "10.0.0.7:20017"
 PROGRAMS = {
-    # Four nodes, from the third time on that somebody asks; and a head from the second time on.
+    # A head from the second time on that somebody asks, once it was started, and one node more each time, up to four.
     "ray": 'echo "ray $*" >> calls\n'
     'case "$1" in\n'
-    '  health-check) test "$(grep -c health-check calls)" -ge 2;;\n'
-    '  status) for node in $(seq $(($(grep -c status calls) + 1))); do echo " 1 node_$node"; done;;\n'
+    '  health-check) grep -q -- --head calls && test "$(grep -c health-check calls)" -ge 2;;\n'
+    "  status) asked=$(grep -c status calls); grep -q -- --exclude calls || asked=0\n"
+    '    for node in $(seq $((asked > 3 ? 4 : asked + 1))); do echo " 1 node_$node"; done;;\n'
     "esac\n",
-    "srun": 'echo "srun $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN} $*" >> calls\n',
+    # It runs as long as the job, unless FAILS says for which nodes it ends at once.
+    "srun": 'echo "srun $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN} $*" >> calls\n'
+    'test "$1" = "$FAILS" || exec tail --pid=$PPID -s 0.1 -f /dev/null\n',
     "tune-jobs": 'echo "tune-jobs $$ $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN} $*" >> calls\nmkdir -p sweeps/acrobot\n'
     "exit 130\n",
     "hostname": 'if [ "$1" = -I ]; then echo "10.0.0.7 172.17.0.1 "; else echo n1; fi\n',
@@ -38,18 +41,27 @@ class Batch:
             (cwd / "bin" / name).write_text(f"#!/bin/bash\n{body}")
             (cwd / "bin" / name).chmod(0o755)
 
-    def run(self, script: str, **job: str) -> list[str]:
+    def run(self, script: str, job: dict[str, str] = JOB) -> list[str]:
         """Run a script, which has to end as `tune-jobs` does, in its process; what was called."""
+        pid, code, err, (*calls, last) = self.outcome(script, job)
+        assert (code, err) == (130, "")
+        # What SIGTERM is sent to.
+        assert last.startswith(f"tune-jobs {pid} ")
+        return [*calls, last.replace(f"{pid} ", "")]
+
+    def outcome(self, script: str, job: dict[str, str]) -> tuple[int, int, str, list[str]]:
+        """The process that ran a script, its exit code, what it said of errors and what was called."""
         (self.cwd / "calls").write_text("")
         (self.cwd / "sweep.sh").write_text(script)
-        env = {"PATH": f"{self.cwd / 'bin'}:{os.environ['PATH']}"} | JOB | job
-        with subprocess.Popen(["/bin/bash", "sweep.sh"], cwd=self.cwd, env=env, stderr=subprocess.PIPE) as process:
-            _, err = process.communicate(timeout=60)
-        assert (process.returncode, err) == (130, b"")
-        *calls, last = (self.cwd / "calls").read_text().splitlines()
-        # What SIGTERM is sent to.
-        assert last.startswith(f"tune-jobs {process.pid} ")
-        return [*calls, last.replace(f"{process.pid} ", "")]
+        env = {"PATH": f"{self.cwd / 'bin'}:{os.environ['PATH']}"} | job
+        with subprocess.Popen(
+            ["/bin/bash", "sweep.sh"], cwd=self.cwd, env=env, stderr=subprocess.PIPE, text=True
+        ) as process:
+            try:
+                _, err = process.communicate(timeout=60)
+            finally:
+                process.kill()
+        return process.pid, process.returncode, err, (self.cwd / "calls").read_text().splitlines()
 
 
 @pytest.fixture
@@ -74,13 +86,24 @@ def test_the_script_for_several_nodes_makes_a_ray_of_all_of_them_first(batch: Ba
     # Others join a head that answers, and the sweep begins with all of them.
     assert calls.index(others) > calls.index(head)
     asked = [call for call in calls if call.startswith("ray ")]
-    assert asked == [*[f"ray health-check --address {ADDRESS}"] * 2, *[f"ray status --address {ADDRESS}"] * 3]
+    assert asked == sorted(asked)
+    assert set(asked) == {f"ray health-check --address {ADDRESS}", f"ray status --address {ADDRESS}"}
+    assert (asked.count(asked[0]) >= 2, asked.count(asked[-1]) >= 3) == (True, True)
     assert batch.run(SEVERAL)[-1] == f"tune-jobs token 64 resume acrobot --address {ADDRESS}"
 
 
 def test_a_job_without_gpus_has_none_in_ray(batch: Batch) -> None:
-    calls = batch.run(SEVERAL.replace("${SLURM_GPUS_ON_NODE:-0}", "${NO_SUCH_VARIABLE:-0}"))
+    calls = batch.run(SEVERAL, {name: value for name, value in JOB.items() if name != "SLURM_GPUS_ON_NODE"})
     assert sum("--num-gpus=0 " in call for call in calls) == 2
+
+
+@pytest.mark.parametrize("nodes", ["--nodes=1", "--nodes=3"])
+def test_nodes_that_cannot_start_ray_end_the_job_and_are_not_waited_for(batch: Batch, nodes: str) -> None:
+    # As many as are asked for never come.
+    (batch.cwd / "bin" / "ray").write_text('#!/bin/bash\ntest "$1 $FAILS" = "health-check --nodes=3"\n')
+    _, code, err, calls = batch.outcome(SEVERAL, JOB | {"FAILS": nodes})
+    assert (code, "No such process" in err) == (1, True)
+    assert calls[-1].split()[3] == nodes
 
 
 def test_rays_options_are_there() -> None:

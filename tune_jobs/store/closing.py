@@ -13,7 +13,7 @@ from tune_jobs.store import transitions
 from tune_jobs.store.contract import Sweep
 
 
-def end_process(store: Sweep, last_words: str, exit_code: int, run_time_s: float = 0.0) -> NoReturn:
+def end_process(store: Sweep, last_words: str, exit_code: int, run_time_s: float) -> NoReturn:
     """Write how the run ended, as `close_run` does, print why, and end this process at once; any thread may."""
     from tune_jobs.process.streams import say_at_last
 
