@@ -1,5 +1,6 @@
 """One Ray for all tests here, and a package of test environments that its worker processes find too."""
 
+import contextlib
 import gc
 import inspect
 import math
@@ -127,20 +128,24 @@ def env_plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def ray_session(env_plugin: None) -> Iterator[None]:
-    """A Ray of two CPUs, started as a sweep starts its own, packs' processes as forks included.
+    """A Ray of two CPUs, started as a sweep starts its own, trials' processes as forks included.
 
     RLlib would start one without these settings. With processes of Ray alone, each of which imports for seconds,
-    the tests of tests/ray take half as long again.
+    the tests of tests/ray take half as long again. What is forked trains packs in one test and RLlib in the next.
     """
     import ray
 
     from tune_jobs.plan.machine import Machine
-    from tune_jobs.ray_tune import local_ray
+    from tune_jobs.ray_tune import forks, local_ray
     from tune_jobs.ray_tune.environment import prepare_environment
-    from tune_jobs.ray_tune.forks import fork_server
 
     prepare_environment()
-    with fork_server() as forks, local_ray.without_environments():
-        local_ray.start(Machine(2), forks)
+    with contextlib.ExitStack() as stack:
+        with pytest.MonkeyPatch.context() as patched:
+            for imported in (forks._EARLY, forks._LATE):
+                patched.setitem(imported, "packs", (*imported["packs"], *imported["trials"]))
+            server = stack.enter_context(forks.fork_server("packs"))
+        stack.enter_context(local_ray.without_environments())
+        local_ray.start(Machine(2), server)
         yield
         ray.shutdown()

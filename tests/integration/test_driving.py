@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from signal import Signals
 from typing import Any, cast
@@ -284,9 +285,10 @@ def test_a_hint_asks_for_no_trial_without_a_cpu(cpus: int, hint: str) -> None:
 
 
 class Begun:
-    """In the place of a process from which packs are forked."""
+    """In the place of a process from which those of trials are forked."""
 
-    def __init__(self) -> None:
+    def __init__(self, forked: str) -> None:
+        self.forked = forked
         self.ended: list[bool] = []
 
     def close(self, *, at_once: bool = False) -> None:
@@ -298,8 +300,8 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> list[Begun]:
     """Those that were begun, in a process that has not joined Ray."""
     all_of_them: list[Begun] = []
 
-    def begin() -> Begun:
-        all_of_them.append(Begun())
+    def begin(forked: str) -> Begun:
+        all_of_them.append(Begun(forked))
         return all_of_them[-1]
 
     monkeypatch.setattr("tune_jobs.ray_tune.forks._begin", begin)
@@ -313,12 +315,54 @@ def test_packs_are_begun_before_the_plan_and_ended_where_that_is_refused(begun: 
     assert [each.ended for each in begun] == [[True]]
 
 
-def test_no_packs_are_begun_where_none_may_come(
+RUNNERS = {"engine": "rllib", "resources": {"num_env_runners": 1}}
+FORKED = [
+    ({}, "packs"), ({"engine": "rllib"}, "trials"), (RUNNERS, "trials"),
+    # Ray has libraries use as many threads.
+    ({"engine": "rllib", "resources": {"num_cpus": 2}}, None),
+    ({"algorithm": "random", "space": {}}, None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("settings", "forked"), FORKED)
+def test_what_is_forked_is_begun_by_what_may_come_and_is_what_comes(
+    begun: list[Begun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], forked: str | None
+) -> None:
+    asked: list[str | None] = []
+
+    def connect(*_: object, forked: str | None, **__: object) -> None:
+        asked.append(forked)
+        raise CannotRunError("no Ray")
+
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.connect", connect)
+    with pytest.raises(CannotRunError, match="no Ray"):
+        sweeps.launch({**SPEC, **settings}, name="new", storage=tmp_path, progress="none")
+    assert asked == [forked]
+    assert [each.forked for each in begun] == [forked] * (forked is not None)
+
+
+def test_what_is_planned_without_packs_is_not_forked_as_one(
+    begun: list[Begun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str | None] = []
+
+    def connect(*_: object, forked: str | None, **__: object) -> None:
+        asked.append(forked)
+        raise CannotRunError("no Ray")
+
+    monkeypatch.setattr("tune_jobs.ray_tune.cluster.connect", connect)
+    monkeypatch.setattr(sweeps, "make_plan", lambda *args, **kwargs: replace(make_plan(*args, **kwargs), packs=None))
+    with pytest.raises(CannotRunError, match="no Ray"):
+        sweeps.launch(SPEC, name="new", storage=tmp_path, progress="none")
+    assert ([each.forked for each in begun], asked) == (["packs"], ["trials"])
+
+
+def test_nothing_is_begun_where_nothing_may_come(
     begun: list[Begun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refused = {**SPEC, "env": "Nowhere-v0"}
     with pytest.raises(SpecError):
-        sweeps.launch({**refused, "engine": "rllib"}, storage=tmp_path, progress="none")
+        sweeps.launch({**refused, "engine": "rllib", "resources": {"num_cpus": 2}}, storage=tmp_path, progress="none")
     with monkeypatch.context() as patched:
         patched.setattr("tune_jobs.sweeps.verbs.machine_here", lambda: Machine(2, num_gpus=1))
         with pytest.raises(SpecError):

@@ -40,7 +40,10 @@ said = {
     "me": this_process(), "options": sys.argv[1:], "path": sys.path, "folder": os.getcwd(),
     "environment": dict(os.environ), "threads": len(os.listdir("/proc/self/task")),
     "ids": drawn, "leads_its_group": os.getpgid(0) == os.getpid(), "draw": numpy.random.random(),
-    "loaded": [name for name in ("torch", "ray", "tune_jobs.ray_tune.pack_trainable") if name in sys.modules],
+    "loaded": [
+        name for name in ("torch", "ray", "tune_jobs.ray_tune.pack_trainable", "tune_jobs.training.rllib")
+        if name in sys.modules
+    ],
 }
 print(json.dumps(said), flush=True)
 time.sleep(600)
@@ -70,7 +73,7 @@ def asked(folder: Path, address: str, *options: str, **environment: str) -> dict
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    with fork_server() as found:
+    with fork_server("packs") as found:
         assert found is not None
         yield found.address
 
@@ -93,6 +96,14 @@ def test_a_fork_is_what_the_command_would_have_become(address: str, tmp_path: Pa
     assert len({*one["ids"], *two["ids"]}) == 4
     # Nothing of it multiplies matrices in several threads; see `forking`.
     assert one["threads"] == two["threads"] == 1
+
+
+def test_one_that_is_forked_for_a_single_trial_has_rllib_and_no_ids_of_another(tmp_path: Path) -> None:
+    with fork_server("trials") as found:
+        assert found is not None
+        one, another = (asked(tmp_path, found.address) for _ in range(2))
+    assert one["loaded"] == another["loaded"] == ["torch", "ray", "tune_jobs.training.rllib"]
+    assert len({*one["ids"], *another["ids"]}) == 4
 
 
 def test_ray_starts_a_process_itself_where_it_reads_other_settings(address: str, tmp_path: Path) -> None:
@@ -124,7 +135,7 @@ def test_a_forked_process_that_who_asked_does_not_take_does_nothing(address: str
 
 
 def test_forked_processes_end_with_the_one_that_they_are_forked_from(tmp_path: Path) -> None:
-    with fork_server() as found:
+    with fork_server("packs") as found:
         assert found is not None
         me = asked(tmp_path, found.address)["me"]
         assert not is_gone(me)
@@ -142,7 +153,7 @@ def children() -> list[Path]:
 
 def test_ray_is_loaded_before_a_process_is_asked_for_where_one_was_announced(tmp_path: Path) -> None:
     before = children()
-    with fork_server() as found:
+    with fork_server("packs") as found:
         assert found is not None
         (process,) = (each for each in children() if each not in before)
         found.announce({**os.environ, "RAY_RAYLET_PID": "7", "RAY_that_of_this_node": "1"})
@@ -157,7 +168,7 @@ def test_ray_is_loaded_before_a_process_is_asked_for_where_one_was_announced(tmp
 
 
 def test_who_has_ended_is_announced_nothing() -> None:
-    with fork_server() as found:
+    with fork_server("packs") as found:
         assert found is not None
         found.close()
         found.announce({})
@@ -166,27 +177,27 @@ def test_who_has_ended_is_announced_nothing() -> None:
 def test_one_that_still_imports_when_it_is_ended_ends_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "slow_to_import.py").write_text("import time; time.sleep(60)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(forks, "_EARLY", ("slow_to_import",))
+    monkeypatch.setitem(forks._EARLY, "packs", ("slow_to_import",))
     monkeypatch.setattr(forks, "_PATIENCE_S", 0.2)
     before = children()
-    with fork_server():
+    with fork_server("packs"):
         assert len(children()) == len(before) + 1
     assert children() == before
 
 
 def test_one_that_was_begun_ahead_is_the_one_that_is_used_and_lives_as_long(tmp_path: Path) -> None:
     before = children()
-    with begun_ahead(wanted=True):
+    with begun_ahead("packs"):
         begun = [each for each in children() if each not in before]
         assert len(begun) == 1
-        with begun_ahead(wanted=True):  # a sweep's own, within that of who launches it
+        with begun_ahead("packs"):  # a sweep's own, within that of who launches it
             assert [each for each in children() if each not in before] == begun
-        with fork_server() as found:
+        with fork_server("packs") as found:
             assert found is not None
             assert [each for each in children() if each not in before] == begun
             assert asked(tmp_path, found.address)["loaded"]
         assert children() == before
-        with fork_server() as another:
+        with fork_server("packs") as another:
             assert another is not None
             assert another.address != found.address
     assert children() == before
@@ -199,7 +210,7 @@ def test_one_that_was_begun_ahead_and_is_not_used_ends_at_once_and_leaves_no_fol
         return set(Path(tempfile.gettempdir()).glob("tune-jobs-fork-*"))
 
     others = folders()
-    with begun_ahead(wanted=True):
+    with begun_ahead("packs"):
         begun = [each for each in children() if each not in before]
         assert len(folders() - others) == len(begun) == 1
     assert not begun[0].exists()
@@ -208,7 +219,7 @@ def test_one_that_was_begun_ahead_and_is_not_used_ends_at_once_and_leaves_no_fol
 
 def test_none_is_begun_ahead_where_none_is_wanted() -> None:
     before = children()
-    with begun_ahead(wanted=False):
+    with begun_ahead(None):
         assert children() == before
 
 
@@ -216,7 +227,7 @@ def test_a_killed_driver_leaves_no_folder() -> None:
     script = """
 import sys
 from tune_jobs.ray_tune.forks import begun_ahead, fork_server
-with fork_server() as found:
+with fork_server("packs") as found:
     print(found.address, flush=True)
     sys.stdin.read()
 """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from policies.errors import EnvError, EnvFailedError, SpecError
 from policies.hyperparams import (
@@ -21,7 +21,7 @@ from tune_jobs.plan.estimates import products_per_image
 from tune_jobs.search.points import largest_hyperparams
 from tune_jobs.spec.domains import Domain
 from tune_jobs.spec.engines import Engine, engine_on_record, engines_for
-from tune_jobs.spec.rules import why_none
+from tune_jobs.spec.rules import is_baseline, why_none
 
 if TYPE_CHECKING:
     from policies.envs.make import EnvInfo
@@ -96,6 +96,21 @@ def may_pack(spec: SweepSpec) -> bool:
     """Whether trials of a sweep may be packed, as far as its file tells."""
     able = (engine for engine in engines_for(spec.algorithm) if spec.engine in ("auto", engine.name))
     return any(engine.trains_many and why_none(engine, spec) is None for engine in able)
+
+
+def forked_of(spec: SweepSpec, *, packs: bool) -> Literal["packs", "trials"] | None:
+    """Return what a Ray of this machine forks for a sweep (see `tune_jobs.ray_tune.forks`); None: nothing.
+
+    Args:
+        spec: The sweep.
+        packs: Whether there are packs.
+    """
+    if packs:
+        return "packs"
+    # A baseline needs nothing of RLlib's. Where a trial has several CPUs for its own process, Ray has the libraries of
+    # that use as many threads, of which they take note when they are loaded.
+    is_alone = spec.cpus_per_trial - spec.resources.num_env_runners == 1
+    return "trials" if is_alone and not is_baseline(spec) else None
 
 
 def why_not(

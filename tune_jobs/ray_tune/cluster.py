@@ -33,7 +33,7 @@ from tune_jobs.ray_tune.connected_ray import (
     of_a_sweep,
 )
 from tune_jobs.ray_tune.environment import prepare_environment, variables_for_start
-from tune_jobs.ray_tune.forks import ForkServer, fork_server
+from tune_jobs.ray_tune.forks import Forked, ForkServer, fork_server
 from tune_jobs.ray_tune.local_ray import QUIET, at_loopback, first_line, outside_of_uv, start, without_environments
 from tune_jobs.ray_tune.processes import ending_if_it_fails
 from tune_jobs.ray_tune.reaper import reaping
@@ -57,7 +57,7 @@ def connect(
     machine: Machine | None = None,
     *,
     is_users: bool = False,
-    packs: bool = True,
+    forked: Forked | None = "packs",
     meanwhile: Callable[[], object] | None = None,
 ) -> Iterator[Connection]:
     """Join a cluster, or start Ray on this machine, for the duration of the block.
@@ -68,7 +68,7 @@ def connect(
         address: None: this machine; `auto`, `host:port` or `ray://host:port`.
         machine: The CPUs and GPUs to start Ray with on this machine.
         is_users: Whether the connection stands for one that the caller has in another process.
-        packs: Whether packs are trained, whose processes a Ray of this machine forks then (see `forking`).
+        forked: What a Ray of this machine forks (see `forking`); None: its processes import for themselves.
         meanwhile: What to do while a Ray of this machine starts, for which there is nothing to do but wait.
 
     Raises:
@@ -88,9 +88,9 @@ def connect(
             stack.enter_context(of_a_sweep())
         if address is None:
             stack.enter_context(reaping())
-            if packs and machine is not None and not machine.num_gpus:
+            if forked is not None and machine is not None and not machine.num_gpus:
                 # A driver of a GPU does not survive a fork, and need not be asked whether something has loaded it.
-                forks = stack.enter_context(fork_server())
+                forks = stack.enter_context(fork_server(forked))
         try:
             with ending_if_it_fails(), _keeping_sigterm(), _deaf_to_hangups():
                 if address is None:

@@ -14,28 +14,39 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from os import environ
 from pathlib import Path
+from typing import Literal, TypeAlias
+
+Forked: TypeAlias = Literal["packs", "trials"]
+"""What is forked: processes that train packs, or single trials of RLlib with their env runners."""
 
 _PATIENCE_S = 5.0
-_EARLY = (
-    "torch", "tune_jobs.training.packed", "policies.packed.make", "policies.packed.envs.make",
-    "policies.packed.evaluation", "policies.packed.ppo.stack", "policies.packed.dqn.stack",
-    "gymnasium.envs.classic_control",
-)  # fmt: skip
-_LATE = ("tune_jobs.ray_tune.pack_trainable",)
+_EARLY: dict[Forked, tuple[str, ...]] = {
+    "packs": (
+        "torch", "tune_jobs.training.packed", "policies.packed.make", "policies.packed.envs.make",
+        "policies.packed.evaluation", "policies.packed.ppo.stack", "policies.packed.dqn.stack",
+        "gymnasium.envs.classic_control",
+    ),
+    "trials": ("torch", "policies.acting.evaluate", "gymnasium.envs.classic_control", "pandas"),
+}  # fmt: skip
+_LATE: dict[Forked, tuple[str, ...]] = {
+    "packs": ("tune_jobs.ray_tune.pack_trainable",),
+    "trials": ("tune_jobs.ray_tune.trainable", "tune_jobs.training.rllib"),
+}
 
 
 class ForkServer:
-    """The process from which packs are forked.
+    """The process from which a Ray's processes are forked.
 
     Args:
         folder: Where it is asked; it is removed at the end.
         listener: Where it is asked.
+        forked: What is forked from it, for which it imports what they need.
 
     Raises:
         OSError: It cannot be started.
     """
 
-    def __init__(self, folder: tempfile.TemporaryDirectory[str], listener: socket.socket) -> None:
+    def __init__(self, folder: tempfile.TemporaryDirectory[str], listener: socket.socket, forked: Forked) -> None:
         self._folder = folder
         self.address = str(Path(folder.name, "asked"))
         """Where it is asked."""
@@ -43,7 +54,7 @@ class ForkServer:
         listener.bind(self.address)
         listener.listen(64)
         self._process = subprocess.Popen(  # noqa: S603 (this very Python)
-            [sys.executable, program, str(listener.fileno()), ",".join(_EARLY), ",".join(_LATE)],
+            [sys.executable, program, str(listener.fileno()), ",".join(_EARLY[forked]), ",".join(_LATE[forked])],
             # Ray says this to a process of one CPU before that imports anything; libraries read it only then, and
             # products of two threads in each pack would take the cores from one another.
             env={"OMP_NUM_THREADS": "1", **environ},
@@ -86,13 +97,13 @@ _ahead: list[ForkServer] = []
 
 
 @contextlib.contextmanager
-def begun_ahead(*, wanted: bool) -> Iterator[None]:
+def begun_ahead(forked: Forked | None) -> Iterator[None]:
     """Begin a fork server, which the first `fork_server` of the block takes: it imports while a sweep is planned.
 
     Args:
-        wanted: Whether to; there is one for a process at most.
+        forked: What is forked from it, as far as is known; None: none is begun. There is one for a process at most.
     """
-    server = _begin() if wanted and not _ahead else None
+    server = None if forked is None or _ahead else _begin(forked)
     if server is None:
         yield
         return
@@ -106,12 +117,15 @@ def begun_ahead(*, wanted: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def fork_server() -> Iterator[ForkServer | None]:
-    """Start the process from which packs are forked, for the block, or take the one that was begun ahead.
+def fork_server(forked: Forked) -> Iterator[ForkServer | None]:
+    """Start the process from which a Ray's are forked, for the block, or take the one that was begun ahead.
 
     None: there is none, and Ray starts its processes as it does without.
+
+    Args:
+        forked: What is forked from it. One that was begun for the other kind does, too: the rest is imported anew.
     """
-    server = _ahead.pop() if _ahead else _begin()
+    server = _ahead.pop() if _ahead else _begin(forked)
     try:
         yield server
     finally:
@@ -119,14 +133,14 @@ def fork_server() -> Iterator[ForkServer | None]:
             server.close()
 
 
-def _begin() -> ForkServer | None:
+def _begin(forked: Forked) -> ForkServer | None:
     if sys.platform != "linux":
         # Elsewhere the system's own libraries do not survive a fork.
         return None
     folder = tempfile.TemporaryDirectory(prefix="tune-jobs-fork-", ignore_cleanup_errors=True)
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
-            return ForkServer(folder, listener)
+            return ForkServer(folder, listener, forked)
     except OSError:
         # A path of a temporary folder may be too long for a socket: Ray's own processes do as well.
         folder.cleanup()

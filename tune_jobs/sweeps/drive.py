@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from analysis.records import FINISHED, SweepRecord, SweepState
 from policies.errors import CannotRunError, TuneJobsError
-from tune_jobs.plan.engine_choice import PackPlan, may_pack
+from tune_jobs.plan.engine_choice import PackPlan, forked_of, may_pack
 from tune_jobs.plan.machine import Machine, local_machine, usable_cpus
 from tune_jobs.plan.sweep_plan import SweepPlan
 from tune_jobs.plan.user_code import modules_of
@@ -39,6 +39,7 @@ from tune_jobs.sweeps.reached import reached_of
 
 if TYPE_CHECKING:
     from tune_jobs.ray_tune.cluster import Connection
+    from tune_jobs.ray_tune.forks import Forked
 
 _most_cpus: ContextVar[float | None] = ContextVar("most_cpus", default=None)
 
@@ -76,7 +77,9 @@ def write_new(
     return created_at
 
 
-def connected(address: str | None, here: Machine | None, *, packs: bool = False) -> AbstractContextManager[Connection]:
+def connected(
+    address: str | None, here: Machine | None, *, forked: Forked | None = None
+) -> AbstractContextManager[Connection]:
     """Join a cluster or start Ray here; see `cluster.connect`. Ray is imported only when this is called.
 
     Raises:
@@ -87,11 +90,11 @@ def connected(address: str | None, here: Machine | None, *, packs: bool = False)
         check_address(address)
     from tune_jobs.ray_tune.cluster import connect
 
-    return connect(address, here, packs=packs, meanwhile=import_what_runs_trials)
+    return connect(address, here, forked=forked, meanwhile=import_what_runs_trials)
 
 
-def packs_begun_ahead(spec: SweepSpec, here: Machine | None) -> AbstractContextManager[None]:
-    """Let the process from which packs are forked import what they need while the block plans a sweep.
+def forks_begun_ahead(spec: SweepSpec, here: Machine | None) -> AbstractContextManager[None]:
+    """Let the process from which those of trials are forked import what they need while the block plans a sweep.
 
     Args:
         spec: The sweep, of which something is left to train.
@@ -100,8 +103,8 @@ def packs_begun_ahead(spec: SweepSpec, here: Machine | None) -> AbstractContextM
     from tune_jobs.ray_tune.forks import begun_ahead
 
     # As `cluster.connect` asks for one.
-    wanted = here is not None and not here.num_gpus and not _has_joined_ray() and may_pack(spec)
-    return begun_ahead(wanted=wanted)
+    is_able = here is not None and not here.num_gpus and not _has_joined_ray()
+    return begun_ahead(forked_of(spec, packs=may_pack(spec)) if is_able else None)
 
 
 @contextlib.contextmanager
@@ -251,8 +254,8 @@ def run_trials_of(
             shared.monitor.begin_stage(told, trials, caps)
         try:
             _run_trials(
-                store, plan, todo, shared, run, address=address, machine=machine, progress=progress,
-                ran_s=record.run_time_s,
+                store, plan, todo, shared, run, address=address, machine=machine,
+                forked=forked_of(spec, packs=plan.packs is not None), progress=progress, ran_s=record.run_time_s,
             )  # fmt: skip
         finally:
             run.release()
@@ -274,6 +277,7 @@ def _run_trials(
     *,
     address: str | None,
     machine: Machine | None,
+    forked: Forked | None,
     progress: str,
     ran_s: float,
 ) -> None:
@@ -297,7 +301,7 @@ def _run_trials(
         with current().asking(ask):
             if shared.connection is None:
                 try:
-                    shared.connection = stack.enter_context(connected(address, machine, packs=plan.packs is not None))
+                    shared.connection = stack.enter_context(connected(address, machine, forked=forked))
                 except CannotRunError:
                     # A signal that ends Ray's processes as they start is no failure of Ray's, either.
                     if current().came:

@@ -18,7 +18,7 @@ from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.adding import add_what_is_missing, with_chosen_point
 from tune_jobs.sweeps.changed_code import notes_on_commit
-from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled
+from tune_jobs.sweeps.drive import connected, forks_begun_ahead, machine_here, settled
 from tune_jobs.sweeps.outcome import SweepResult
 from tune_jobs.sweeps.own_job import note_own_job
 from tune_jobs.sweeps.repeating import check_takes_more, plan_of_repetition
@@ -141,7 +141,7 @@ def _taken_over(
         if machine is not None:
             note_wait(store, None)
             if more or any(trial.status not in FINISHED for trial in store.read_trials()):
-                stack.enter_context(packs_begun_ahead(stored_spec(store.read_record()), machine))
+                stack.enter_context(forks_begun_ahead(stored_spec(store.read_record()), machine))
             yield machine, machine, _notes_on_versions(store.read_record())
             return
         connection = stack.enter_context(connected(address, None))

@@ -24,7 +24,7 @@ from tune_jobs.sweeps.alone import run_alone
 from tune_jobs.sweeps.compare import compare
 from tune_jobs.sweeps.create import CreatedSweep, removed_if_not_begun, write_created
 from tune_jobs.sweeps.detached import cancel_waiting
-from tune_jobs.sweeps.drive import connected, machine_here, packs_begun_ahead, settled, write_new
+from tune_jobs.sweeps.drive import connected, forks_begun_ahead, machine_here, settled, write_new
 from tune_jobs.sweeps.exports import dataframe, export, figure, study
 from tune_jobs.sweeps.outcome import Progress, SweepResult
 from tune_jobs.sweeps.policies import best, evaluate, restore, video
@@ -182,7 +182,7 @@ def _launch_here(
     # Planned here and not only on the cluster, so that a bad env or point is found before Ray starts.
     machine = machine_here() if address is None else None
     with contextlib.ExitStack() as stack:
-        stack.enter_context(packs_begun_ahead(spec, machine))
+        stack.enter_context(forks_begun_ahead(spec, machine))
         prior = read_priors(spec, storage)
         plan = make_plan(spec, machine, prior=prior) if machine is not None else None
         if plan is None:
