@@ -26,7 +26,7 @@ def made(folder: Path) -> str:
 
 
 @pytest.mark.parametrize("fault", ["no pip", "no Python"])
-def test_a_broken_virtual_environment_is_mended_and_a_sound_one_left_alone(tmp_path: Path, fault: str) -> None:
+def test_a_broken_environment_is_mended_and_a_sound_one_left_alone(tmp_path: Path, fault: str) -> None:
     for name in ("Makefile", "pyproject.toml", "constraints.txt"):
         shutil.copy(ROOT / name, tmp_path)
     venv = tmp_path / ".venv"

@@ -180,7 +180,7 @@ def test_a_checkpoint_of_more_env_runners_than_cpus_is_restored_without_them(che
     algo.stop()
 
 
-@pytest.mark.parametrize(("num_cpus", "num_left"), [(2.0, 1), (1.0, 0)])
+@pytest.mark.parametrize(("num_cpus", "num_left"), [(2.0, 1), (1.0, 0)], ids=["enough", "few"])
 @pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
 def test_env_runners_are_restored_where_there_are_cpus_for_them_and_for_one_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algorithm: str, num_cpus: float, num_left: int

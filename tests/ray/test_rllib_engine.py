@@ -151,7 +151,7 @@ def test_a_restored_trial_does_not_see_its_first_episodes_again(engine: RLlibEng
     assert first[0].isdisjoint(first[1])
 
 
-@pytest.mark.parametrize("num_env_runners", [0, 1])
+@pytest.mark.parametrize("num_env_runners", [0, 1], ids=["itself", "an env runner"])
 def test_dqn_fills_its_replay_buffer_again(engine: RLlibEngine, tmp_path: Path, num_env_runners: int) -> None:
     """It is not in checkpoints; training on a handful of transitions would undo what was learned."""
     task = make_task(tmp_path, "dqn", learning_starts=50, num_env_runners=num_env_runners)
@@ -186,7 +186,7 @@ def test_dqn_with_env_runners_sends_them_its_weights(engine: RLlibEngine, tmp_pa
     assert same(theirs, {name: ours[name] for name in theirs})
 
 
-@pytest.mark.parametrize("changes", [{}, {"lr": 0.002}])
+@pytest.mark.parametrize("changes", [{}, {"lr": 0.002}], ids=["resumed", "copied"])
 def test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_arrived(
     engine: RLlibEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float]
 ) -> None:
