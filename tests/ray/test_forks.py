@@ -104,6 +104,7 @@ def test_one_that_is_forked_for_a_single_trial_has_rllib_and_no_ids_of_another(t
         one, another = (asked(tmp_path, found.address) for _ in range(2))
     assert one["loaded"] == another["loaded"] == ["torch", "ray", "tune_jobs.training.rllib"]
     assert len({*one["ids"], *another["ids"]}) == 4
+    assert one["threads"] == another["threads"] == 1
 
 
 def test_ray_starts_a_process_itself_where_it_reads_other_settings(address: str, tmp_path: Path) -> None:
