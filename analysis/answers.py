@@ -37,6 +37,9 @@ def setting_score(settings: SettingsRecord) -> str:
         parts[0] += f" ({ends} with 95 %, over training seeds)"
     if less := less_expected(settings):
         parts.append(less)
+    if num := settings.num_never(best):
+        whose = "its seed" if len(best.scores) == 1 else f"{num} of {len(best.scores)} seeds"
+        parts.append(f"{whose} never reached it, which counts as {_steps_text(settings.never_reached or 0)}")
     if best.num_solved is not None:
         parts.append(f"{best.num_solved} of {counted(len(best.scores), 'seed')} solved it in training")
     if best.num_failed:

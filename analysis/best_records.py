@@ -110,6 +110,11 @@ class SettingsRecord(Record):
     num_may_be_best: Count = Field(description="How many of all the data can't tell from the best, itself included.")
     ranking: tuple[SettingRecord, ...] = Field(min_length=1, description="The leading ones, best first.")
     front: FrontRecord | None = Field(None, description="Score against cost; None: the sweep doesn't ask for it.")
+    never_reached: Count | None = Field(
+        None,
+        description="steps_to_threshold: what a seed that never reaches it counts as, in env steps, twice those of the "
+        "longest training; None: another objective, or a former record.",
+    )
     most_seeds: Count | None = Field(None, description="The most that any setting has; None: a former record.")
 
     @property
@@ -121,6 +126,10 @@ class SettingsRecord(Record):
     def several_seeds(self) -> bool:
         """Whether any setting, listed or not, has two seeds or more; of a former record, any that is listed."""
         return (self.most_seeds or max(len(item.scores) for item in self.ranking)) > 1
+
+    def num_never(self, item: SettingRecord) -> int:
+        """Return how many seeds of a setting never reached the threshold, those that failed included."""
+        return 0 if self.never_reached is None else item.scores.count(-float(self.never_reached))
 
 
 class CandidateRecord(Record):

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from analysis.best_records import BestRecord, CandidateRecord, ChoiceRecord, EvaluationRecord
-from analysis.statistics import mean_with_ci
+from analysis.statistics import episodes_interval
 from analysis.successive_rejects import TIED
 from analysis.wording import NONE, counted, interval_text, range_text, return_text
 from policies import random_streams
@@ -79,12 +79,14 @@ def _confirmed(record: EvaluationRecord | None, none: str) -> str:
     if record is None:
         return none
     text = return_text(record.mean_return)
+    if record.num_episodes == 1:
+        return text
     if min(record.returns) == max(record.returns):
         return f"{text} (all {record.num_episodes:,} equal)"
     if any(abs(value) >= _MAX_AVERAGED or math.isnan(value) for value in record.returns):
         return text
     # The same resamples as for the winner's card, so that a page has one interval for one thing.
-    return f"{text} ({interval_text(mean_with_ci(record.returns, rng=random_streams.fixed()))})"
+    return f"{text} ({interval_text(episodes_interval(record.returns, rng=random_streams.fixed()))})"
 
 
 def _out(item: CandidateRecord) -> str:

@@ -145,10 +145,11 @@ def failed_score(scores: Iterable[float], objective: Objective, *, num_env_steps
         num_env_steps: The env steps that the longest training has.
     """
     worst = min(scores)
-    return min(worst, _never_reached(num_env_steps)) if objective == "steps_to_threshold" else worst
+    return min(worst, never_reached(num_env_steps)) if objective == "steps_to_threshold" else worst
 
 
-def _never_reached(num_env_steps: int) -> float:
+def never_reached(num_env_steps: int) -> float:
+    """Return the score by `steps_to_threshold` of one that never does, where the longest training has so many steps."""
     return -2.0 * num_env_steps
 
 
@@ -277,7 +278,7 @@ def trial_score(
         if threshold is None:
             raise ValueError("steps_to_threshold needs a threshold")
         reached = (-float(steps) for steps, value in evaluations if value >= threshold)
-        return next(reached, _never_reached(num_env_steps)) if iterations else None
+        return next(reached, never_reached(num_env_steps)) if iterations else None
     if objective == "final":
         return _final(iterations, evaluations, num_env_steps)
     if not evaluations:

@@ -11,8 +11,8 @@ from typing import Any
 
 from analysis.best_records import SettingRecord, SettingsRecord
 from analysis.front import front_of, untrained_return
-from analysis.objectives import SettingScores, rank_settings
-from analysis.records import Cost, IterationRecord, Objective, TrialRecord
+from analysis.objectives import SettingScores, never_reached, rank_settings
+from analysis.records import Cost, IterationRecord, Objective, TrialRecord, longest_length
 from analysis.statistics import known_intervals, probability_of_being_best, tell_the_best, tie_groups
 from analysis.tables import env_steps_to
 from policies import random_streams
@@ -53,6 +53,7 @@ def judge_settings(
     if not ranking:
         return None
     known = _known(ranking)
+    longest = longest_length(trials, num_env_steps=num_env_steps, num_iterations=num_iterations)
     return SettingsRecord(
         objective=objective,
         threshold=threshold,
@@ -73,6 +74,7 @@ def judge_settings(
             for index, item in enumerate(ranking[:NUM_LISTED])
         ),
         front=None if cost is None else front_of(ranking, untrained_return(results)),
+        never_reached=None if objective != "steps_to_threshold" else round(-never_reached(longest)),
         most_seeds=max(len(item.scores) for item in ranking),
     )
 

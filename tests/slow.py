@@ -67,10 +67,10 @@ SLOW = {
         "the same, packed, and tests/unit/test_own_process.py",
     "tests/ray/test_pack_interruption.py::test_members_go_on_from_their_checkpoints_after_a_kill_and_an_interruption":
         "`make kills`, and tests/ray/test_interruption.py",
-    "tests/ray/test_packed_images.py::test_both_engines_learn_to_look_at_a_member_of_stacked_observations[dqn-TestBeside-v0]":
-        _PPO,
+    "tests/ray/test_packed_images.py::test_both_engines_learn_to_look_at_a_member_of_stacked_observations[ppo-TestMaskedBeside-v0]":
+        "the same, TestBeside-v0",
     "tests/ray/test_packed_images.py::test_both_engines_learn_to_look_at_a_member_of_stacked_observations[dqn-TestMaskedBeside-v0]":
-        _PPO,
+        "the same, TestBeside-v0",
     "tests/ray/test_packed_images.py::test_a_trial_of_rllibs_learns_to_look_at_what_is_no_plain_image[dqn-TestMaskedShades-v0]":
         _PPO,
     "tests/ray/test_packed_images.py::test_a_trial_of_rllibs_learns_to_look_at_what_is_no_plain_image[dqn-TestMaskedBeside-v0]":
@@ -96,8 +96,6 @@ SLOW = {
         "the other test of its file, packed",
     "tests/ray/test_rllib_engine.py::test_dqn_fills_its_replay_buffer_again[an env runner]":
         "the same, itself, and the next test of its file",
-    "tests/ray/test_rllib_engine.py::test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_arrived[resumed]":
-        "the same, copied",
     "tests/ray/test_schedulers.py::test_a_trial_without_a_finite_score_never_runs_on[hyperband]":
         "the same, asha, and tests/ray/test_hyperband.py",
     "tests/ray/test_schedulers.py::test_every_scheduler_runs_to_the_end[hyperband]": "tests/ray/test_hyperband.py",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.charts.model import Axis, Chart, Line, Number, Plot, Plots, drawable
 from analysis.charts.subject import Subject
+from analysis.first_seeds import first_seeds
 from analysis.objectives import SettingScores
 from analysis.plot_style import PALETTE
 from analysis.statistics import performance_profile
@@ -108,17 +109,18 @@ def _profile_chart(subject: Subject) -> Chart:
     )
     whole = {trial.trial_id for trial in subject.trials if subject.ending(trial) in ("whole", "failed")}
     settings = [setting for setting in subject.settings if whole.issuperset(setting.trial_ids)]
-    scores = [score for setting in settings for score in setting.scores if drawable(score) == score]
-    if len(scores) < 2 or min(scores) == max(scores):
+    scores = _drawn(setting.scores for setting in settings)
+    first = _drawn(first_seeds(settings, subject.sweep))
+    if len(first) < 2 or min(scores) == max(scores):
         why = (
             f"All {len(scores)} whole trials scored the same, so the profile would be one step."
-            if len(scores) > 1
+            if len(first) > 1
             else "A profile takes the scores of at least two trials that trained to their end."
         )
         return Chart("performance_profile", "learning", title, caption, None, why)
     margin = 0.03 * (max(scores) - min(scores))
     thresholds = np.linspace(min(scores) - margin, max(scores) + margin, _NUM_POINTS)
-    lines = [_profile_line("all settings", "muted", scores, thresholds)]
+    lines = [_profile_line("all settings", "muted", first, thresholds)]
     for rank, setting in enumerate(subject.settings[:NUM_TOP]):
         if setting in settings and len(setting.scores) > 1:
             name = f"{rank + 1}. {subject.setting_name(setting)} ({counted(len(setting.scores), 'seed')})"
@@ -126,12 +128,22 @@ def _profile_chart(subject: Subject) -> Chart:
             line = _profile_line(name, f"series-{rank % len(PALETTE)}", setting.scores, thresholds)
             lines.append(line if rank == 0 else dataclasses.replace(line, lower=(), upper=()))
     notes = ["A trial that failed counts as the worst score."] if any(item.num_failed for item in settings) else []
+    if len(first) < len(scores):
+        notes.append(
+            "All settings: as many seeds of each as every one has, the first ones. A race or a replication gave the "
+            "leading ones more, by which they would count more often."
+        )
     if subject.num_not_whole:
         notes.append("Settings with trials that did not train to the end are left out.")
     if len(lines) == 1 and not subject.is_population:
         notes.append("One seed a setting gives no profile of a single setting: replicate the leading ones.")
     plot = Plot(Axis(subject.score_name), Axis("share of seeds", low=0, high=1), tuple(lines))
     return Chart("performance_profile", "learning", title, caption, Plots((plot,)), notes=tuple(notes))
+
+
+def _drawn(settings: Iterable[Sequence[float]]) -> list[float]:
+    """Return the scores of all settings that axes can be drawn to as they are."""
+    return [score for scores in settings for score in scores if drawable(score) == score]
 
 
 def _profile_line(name: str, color: str, scores: Sequence[float], thresholds: NDArray[np.float64]) -> Line:

@@ -12,7 +12,7 @@ from analysis.comparison.entries import Entry, Wanted, judged_alike, make_entry
 from analysis.comparison.pairs import Pair, make_pair
 from analysis.comparison.repetition import same_numbers
 from analysis.exports.frames import ranked_settings
-from analysis.objectives import failed_score
+from analysis.objectives import failed_score, never_reached
 from analysis.records import FINISHED, Objective, SweepRecord, TrialRecord
 from analysis.report_data import are_one_env, env_arguments_of, env_of
 from analysis.wording import counted
@@ -169,10 +169,8 @@ def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry], longest: in
     if len(set(budgets.values())) > 1:
         told = ", ".join(f"{letter} {steps:,}" for letter, steps in budgets.items())
         notes.append(f"Trials may take different numbers of env steps: {told}.")
-        if longest is not None:
-            notes.append(
-                f"One that never reaches the threshold counts as {2 * longest:,} env steps, twice the longest."
-            )
+    if longest is not None and (len(set(budgets.values())) > 1 or _some_never_reach(entries, longest)):
+        notes.append(f"One that never reaches the threshold counts as {2 * longest:,} env steps, twice the longest.")
     versions = [item.sweep.versions for item in wanted]
     other = sorted(
         {name for known in versions for name in known if any(each.get(name) != known[name] for each in versions)}
@@ -183,6 +181,10 @@ def _told_of_all(wanted: Sequence[Wanted], entries: Sequence[Entry], longest: in
         )
         notes.append(f"They ran with different versions: {told}.")
     return notes
+
+
+def _some_never_reach(entries: Sequence[Entry], longest: int) -> bool:
+    return any(never_reached(longest) in entry.scores for entry in entries)
 
 
 def _same_trainings(wanted: Sequence[Wanted], entries: Sequence[Entry]) -> list[str]:

@@ -228,12 +228,21 @@ def _scored(chosen: SettingScores, ranking: Sequence[SettingScores]) -> dict[str
 
 
 def _median(chosen: SettingScores, data: SweepData) -> dict[str, Any]:
-    """Return the median of the env steps to the threshold; seeds that did not reach it are censored."""
+    """Return the median of the env steps to the threshold; seeds that did not reach it are censored.
+
+    One that failed, or that a scheduler ended, counts with the env steps that it was to have: taken out where it ended,
+    it would leave the median to those that went well.
+    """
     if data.threshold is None:
         return {}
     rows = [data.results.get(trial_id, ()) for trial_id in chosen.trial_ids]
     reached = [env_steps_to(data.threshold, items) for items in rows]
-    curve = steps_to_threshold(reached, [items[-1].num_env_steps if items else 0 for items in rows])
+    ends = [items[-1].num_env_steps if items else 0 for items in rows]
+    completed = {trial.trial_id for trial in data.trials if trial.status == "completed"}
+    # A last iteration may go beyond what was to be trained.
+    whole = max(*chosen.env_steps, *ends)
+    lengths = [end if trial_id in completed else whole for trial_id, end in zip(chosen.trial_ids, ends, strict=True)]
+    curve = steps_to_threshold(reached, lengths)
     lower, upper = curve.median_interval
     several = len(rows) > 1
     return {

@@ -13,6 +13,7 @@ from analysis.comparison.entries import Entry, Wanted, judged_alike
 from analysis.comparison.wording import fact_rows, pair_lines
 from analysis.exports.frames import ranked_settings
 from analysis.exports.paper import Returns, curves_of
+from analysis.first_seeds import first_seeds
 from analysis.objectives import SettingScores
 from analysis.page_templates import make_environment, template_file
 from analysis.plot_style import (
@@ -41,8 +42,9 @@ _NUM_THRESHOLDS = 200
 _MAX_BANDS = 3
 """More bands than these hide each other."""
 _PROFILE = (
-    "The share of trainings that score more than a return. Of a sweep all of its trainings are counted, of a setting "
-    "its seeds. Bands, of up to three: pointwise 95 % intervals (Wilson)."
+    "The share of trainings that score more than a return. Of a sweep all settings are counted with as many seeds as "
+    "each of them has, the first ones, so that a race, which gives the leading ones more, makes none count more often; "
+    "of a setting all of its seeds. Bands, of up to three: pointwise 95 % intervals (Wilson)."
 )
 _CURVES = (
     "Mean greedy evaluation over training seeds; a seed that ended early is held at its last value, and one that "
@@ -99,7 +101,7 @@ def write_page(path: Path, comparison: Comparison, wanted: Mapping[str, Wanted])
 def profile_figure(comparison: Comparison, wanted: Mapping[str, Wanted], size: Size) -> Figure | None:
     """Draw the share of trainings that score more than each return, a performance profile; None: there is none.
 
-    A sweep's are all that have been judged, over all of its settings; a setting's are its seeds.
+    A sweep's are those of `first_seeds`, over all of its settings; a setting's are its seeds.
 
     Source:
         Agarwal et al. 2021, see `statistics.performance_profile`.
@@ -191,10 +193,10 @@ def _setting(entry: Entry, wanted: Wanted) -> SettingScores | None:
 
 
 def _runs(entry: Entry, wanted: Wanted) -> Sequence[float]:
-    """Return the scores of all trainings of a sweep, or of the seeds of a setting."""
+    """Return the scores of the first seeds of a sweep's settings, or of all seeds of a setting."""
     if not entry.is_sweep:
         return entry.scores
-    return [score for item in ranked_settings(wanted.data) for score in item.scores]
+    return [score for scores in first_seeds(ranked_settings(wanted.data), wanted.sweep) for score in scores]
 
 
 def _look(comparison: Comparison, entry: Entry) -> tuple[str, str]:

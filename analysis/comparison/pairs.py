@@ -10,6 +10,7 @@ from typing import Any
 
 from analysis.comparison.entries import Entry, Wanted
 from analysis.exports.frames import ranked_settings
+from analysis.first_seeds import first_seeds
 from analysis.points import meaning_of
 from analysis.records import TRAINING_LENGTH, SweepRecord
 from analysis.statistics import Estimate, iqm, iqm_with_ci, probability_of_improvement, t_quantile
@@ -24,17 +25,18 @@ _MOST_NAMED = 3
 class Shared:
     """The settings that two sweeps have in common, each a stratum; points of a sweep with equal values are one.
 
-    A setting is all that a training has of hyperparameters, fixed ones and defaults too.
+    A setting is all that a training has of hyperparameters, fixed ones and defaults too. Of each those seeds count that
+    all settings of its sweep have, see `first_seeds`: a sweep that gave its leading ones more is neither the better nor
+    the worse for it.
     """
 
     num_settings: int
     probability: Estimate
-    """P(a training of the left sweep scores more than one of the right, with the same setting), of all trainings."""
+    """P(a training of the left sweep scores more than one of the right, with the same setting), of all these seeds."""
     left_iqm: Estimate
     """Interquartile mean of trainings with these settings; its ends are NaN where each has one seed.
 
-    Of each setting those seeds count that came first, as many as both sweeps have: a sweep that gave its leading
-    settings more seeds is not the better for it."""
+    Of each setting as many seeds count as both sweeps have, the first ones, so that both weigh settings alike."""
     right_iqm: Estimate
 
 
@@ -235,10 +237,10 @@ def _unsearched(sweep: SweepRecord) -> dict[str, Any]:
 
 
 def _by_meaning(wanted: Wanted, *, with_length: bool) -> dict[str, tuple[float, ...]]:
-    """Return the scores of all seeds of each setting; several points may have equal values, or write them otherwise.
+    """Return the scores of each setting's first seeds; several points may have equal values, or write them otherwise.
 
     A value that one sweep searches and another has fixed, or by default, is the same value. Seeds are in the order in
-    which they came to the sweep: those that a race gave come after those that decided who races.
+    which they came to the sweep.
 
     Args:
         wanted: The sweep.
@@ -249,7 +251,8 @@ def _by_meaning(wanted: Wanted, *, with_length: bool) -> dict[str, tuple[float, 
         unsearched[TRAINING_LENGTH] = wanted.data.num_env_steps
     indices = {trial.trial_id: trial.index for trial in wanted.data.trials}
     seeds: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
-    for item in ranked_settings(wanted.data):
-        came = (indices[trial_id] for trial_id in item.trial_ids)
-        seeds[meaning_of({**unsearched, **item.point})] += zip(came, item.scores, strict=True)
+    settings = ranked_settings(wanted.data)
+    for item, scores in zip(settings, first_seeds(settings, wanted.sweep), strict=True):
+        came = [indices[trial_id] for trial_id in item.trial_ids[: len(scores)]]
+        seeds[meaning_of({**unsearched, **item.point})] += zip(came, scores, strict=True)
     return {meaning: tuple(score for _, score in sorted(found)) for meaning, found in seeds.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from analysis.exports.frames import SweepData, intervals_of, num_solved, ranked_settings
-from analysis.objectives import SettingScores
+from analysis.objectives import SettingScores, never_reached
 from analysis.points import value_text
 from analysis.records import Objective
 from analysis.statistics import Estimate
@@ -77,6 +77,9 @@ def _about(listed: Sequence[tuple[SettingScores, Estimate | None]], data: SweepD
     if data.threshold is not None:
         goal = f"{data.threshold:g}"
         parts.append(f" Solved: seeds whose mean training return over 100 episodes reached {_number_of(goal)}.")
+    never = never_reached(data.longest)
+    if data.objective == "steps_to_threshold" and any(never in item.scores for item, _ in listed):
+        parts.append(f" A seed that never reaches it counts as {-never:.0f}, twice the longest training.")
     if any(item.num_failed for item, _ in listed):
         worst = "one that never reaches it" if data.objective == "steps_to_threshold" else "the worst trial"
         parts.append(f" A failed seed counts as {worst}.")

@@ -13,7 +13,7 @@ from analysis.page.scores import score_text
 from analysis.page.source import Source, point_text
 from analysis.records import FINISHED
 from analysis.selection import NoUsableTrialError, score_trial, select_best
-from analysis.statistics import mean_with_ci, median_steps
+from analysis.statistics import episodes_interval, median_steps
 from analysis.wording import counted, interval_text, known_return_text, number, return_text
 from policies import random_streams
 
@@ -145,10 +145,12 @@ def _runner_up(source: Source, settings: SettingsRecord) -> list[str]:
 
 
 def _as_reliable(best: SettingRecord, other: SettingRecord) -> bool:
-    """Whether the same share of both settings' seeds reached the threshold, and any did."""
-    if not best.num_solved or not other.num_solved:
-        return False
-    return best.num_solved * len(other.scores) == other.num_solved * len(best.scores)
+    """Whether the same share of both settings' seeds reached the threshold, two of each at least.
+
+    One seed that did says little of others: of a setting of which half of the seeds do it is met every second time.
+    """
+    ours, theirs = best.num_solved or 0, other.num_solved or 0
+    return min(ours, theirs) > 1 and ours * len(other.scores) == theirs * len(best.scores)
 
 
 def _outcome(source: Source, settings: SettingsRecord, item: SettingRecord) -> str:
@@ -201,10 +203,10 @@ def _confirmed(confirmation: EvaluationRecord) -> str:
     if not math.isfinite(confirmation.mean_return):
         # It can't be compared with a threshold either.
         return f"its mean return over {episodes} is {text}."
-    if len(set(returns)) == 1:
+    if len(set(returns)) == 1 < len(returns):
         text += f" in each of {episodes}"
-    elif all(abs(value) < _MAX_AVERAGED for value in returns):
-        interval = interval_text(mean_with_ci(returns, rng=random_streams.fixed()))
+    elif len(returns) > 1 and all(abs(value) < _MAX_AVERAGED for value in returns):
+        interval = interval_text(episodes_interval(returns, rng=random_streams.fixed()))
         text += f" over {episodes} ({interval} with 95 %, over episodes of this policy)"
     else:
         text += f" over {episodes}"

@@ -20,7 +20,7 @@ from analysis.page.source import Source, point_pairs
 from analysis.records import SweepRecord, TrialRecord
 from analysis.report_tables import Cell, Table
 from analysis.selection import NoUsableTrialError, is_current, select_best
-from analysis.statistics import mean_with_ci, paired_difference
+from analysis.statistics import episodes_interval, t_interval
 from analysis.wording import counted, return_text, shown_path
 from policies import random_streams
 from policies.acting.movies import still_of
@@ -127,14 +127,16 @@ def _url(media_type: str, data: bytes) -> str:
 def winner_card(best: BestRecord, trials: Sequence[TrialRecord], sweep: SweepRecord, place: str) -> dict[str, Any]:
     """Return the winner's data: its point, both scores, its rivals, the random baseline, and how to load it."""
     confirmation, random, choice = best.confirmation, best.random, best.choice
-    rng = random_streams.fixed()
     interval = gain = None
     if _have_mean(confirmation.returns):
         # Episodes that are all alike say nothing of how others would differ.
         if len(set(confirmation.returns)) > 1:
-            interval = mean_with_ci(confirmation.returns, rng=rng)
-        if _have_mean(random.returns) and random.seeds == confirmation.seeds:
-            gain = paired_difference(confirmation.returns, random.returns, rng=rng)
+            interval = episodes_interval(confirmation.returns, rng=random_streams.fixed())
+        if _have_mean(random.returns) and random.seeds == confirmation.seeds and confirmation.num_episodes > 1:
+            # Pairs of one seed meet the same initial states. By this very interval it is told whether it learned.
+            gain = t_interval(
+                [ours - theirs for ours, theirs in zip(confirmation.returns, random.returns, strict=True)]
+            )
     # Of a sweep in an object store the sweep is what can be named: its best is what is evaluated and loaded.
     policy = shown_path(place if "://" in place else Path(place, "best", "policy.json"))
     return {

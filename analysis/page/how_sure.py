@@ -115,6 +115,9 @@ def _about(source: Source) -> list[str]:
     listed = len(settings.ranking)
     texts = [f"The first {listed} of {settings.num_settings:,} settings." if listed < settings.num_settings else ""]
     texts += _of_seeds(settings)
+    if any(map(settings.num_never, settings.ranking)):
+        never = number(settings.never_reached)
+        texts += [f"A seed that never reaches the threshold counts as {never} env steps, twice the longest training."]
     if any(item.num_failed for item in settings.ranking):
         worst = "a training that never reaches the threshold" if counts_env_steps(settings) else _WORST
         texts += [f"A seed that failed counts as {worst}."]

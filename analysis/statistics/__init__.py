@@ -8,7 +8,7 @@ other episodes, which says nothing about training it again.
 |---|---|
 | the mean over seeds, of each setting of a sweep | `seed_intervals`, the default: it covers the truth best |
 | the same of one setting by itself | `t_interval`, `bootstrap_t_interval` |
-| the mean over hundreds of episodes | `mean_with_ci`, `paired_difference` |
+| the mean over episodes of one policy | `episodes_interval`; `mean_with_ci`, `paired_difference` of hundreds |
 | which setting is best, how surely | `probability_of_being_best` |
 | which settings can't be told apart | `tie_groups` |
 | one sweep, several tasks | `iqm_with_ci`, `performance_profile` |
@@ -20,6 +20,7 @@ Scores are better the higher they are. What the intervals cover, measured, is in
 """
 
 from analysis.statistics.comparisons import Profile, iqm_with_ci, performance_profile, probability_of_improvement
+from analysis.statistics.episodes import episodes_interval
 from analysis.statistics.estimate import Estimate
 from analysis.statistics.few_seeds import bootstrap_t_interval, t_interval
 from analysis.statistics.learning_curve import area_under_curve, has_collapsed, share_lost
@@ -52,6 +53,7 @@ __all__ = [
     "TieGroups",
     "area_under_curve",
     "bootstrap_t_interval",
+    "episodes_interval",
     "has_collapsed",
     "iqm",
     "iqm_with_ci",

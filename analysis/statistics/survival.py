@@ -56,7 +56,8 @@ def steps_to_threshold(
 
     A trial that never reached the threshold counts as not having reached it as long as it trained, and is then taken
     out: it is not said that it never would. That is right for trials that ended by a budget, not for those an early
-    stopping ended because they were bad: with these the curve falls too fast.
+    stopping ended because they were bad: with these the curve falls too fast, unless they count with the env steps that
+    they were to have.
 
     Args:
         reached: For each trial the env steps at which it reached the threshold; None: it never did (it is censored).

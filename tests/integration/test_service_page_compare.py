@@ -63,6 +63,18 @@ def test_sweeps_are_chosen_on_the_list_and_compared(page: Page) -> None:
     page.says(".compare-bar", "2 sweeps chosen")
 
 
+def test_a_curve_of_some_of_the_seeds_says_so(page: Page, live: Live) -> None:
+    made = make_sweep(name="crashed", points=[{"lr": 3e-3}], seeds_per_point=3, failed={1, 2})
+    for trial_id in ("t0001", "t0002"):
+        # They failed before their first evaluation.
+        made.results[trial_id] = made.results[trial_id][:4]
+    write_sweep(live.storage, made)
+    page.open("#/compare?sweeps=cartpole-seeds,crashed")
+    page.says(".curves", "one that failed before it showed any is left out")
+    page.says(".curves", "B is of 1 of 3 seeds.")
+    assert "A is of" not in page.text(".curves")
+
+
 def test_another_address_shows_nothing_of_the_comparison_before(page: Page) -> None:
     page.open(BOTH)
     page.says(".verdicts", "P(A > B)")

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = pytest.mark.ray
 
-# A process that is not forked from ours, as those of trials of the `rllib` engine are not.
+# A process that is not forked from ours, as none is on a machine with a GPU.
 SCRIPT = """
 import os
 from tune_jobs.ray_tune.environment import prepare_environment

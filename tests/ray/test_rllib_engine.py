@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rllib_engines import engine
 from trials import TRIAL_SEED, make_task, run_trial
 
+from analysis.records import ChangeRecord
 from policies.errors import CannotRunError, CheckpointError, NonFiniteWeightsError, NotFoundError
 from policies.packed.member import Weights
 from tune_jobs.spec.sections import StopSpec
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("ray_session")]
 
 __all__ = ["engine"]
+
+COPIED = ChangeRecord(
+    iteration=1, num_env_steps=100, source_trial_id="t0000", source_iteration=1, before={}, after={}, time=0.0
+)
 
 
 def weights_after(
@@ -186,11 +191,11 @@ def test_dqn_with_env_runners_sends_them_its_weights(engine: RLlibEngine, tmp_pa
     assert same(theirs, {name: ours[name] for name in theirs})
 
 
-@pytest.mark.parametrize("changes", [{}, {"lr": 0.002}], ids=["resumed", "copied"])
+@pytest.mark.parametrize("changes", [{}, {"lr": 0.002, "changes": (COPIED,)}], ids=["resumed", "copied"])
 def test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_arrived(
-    engine: RLlibEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float]
+    engine: RLlibEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
 ) -> None:
-    """They would sample with an untrained policy. By another setting, it is a copy for a population."""
+    """They would sample with an untrained policy. A trial of a population copies another one's."""
     from ray import cloudpickle
 
     from policies.rllib.config import build_algorithm_config
@@ -199,7 +204,7 @@ def test_env_runners_get_the_weights_of_a_restore_though_those_before_have_not_a
 
     class Slow(EnvRunner):
         def set_state(self, state: Any) -> None:
-            time.sleep(0.4)
+            time.sleep(1.5)
             super().set_state(state)
 
     cloudpickle.register_pickle_by_value(sys.modules[__name__])

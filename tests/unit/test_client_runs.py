@@ -174,6 +174,8 @@ def test_failed_trials_are_retried_if_there_are_any(run: RunCommand, live: Live)
         worker.join(30)
         assert result.exit_code == 3, result.output
         assert live.service.queue.jobs()[-1].verb == verb
+    again = f"`tune-jobs --server {live.url} resume mine --retry-failed` runs it again."
+    assert again in " ".join(result.stdout.split())
 
 
 def test_ctrl_c_stops_following_and_not_the_sweep(

@@ -196,6 +196,24 @@ def test_env_steps_to_the_threshold_are_a_median_in_which_who_never_reached_it_c
     assert rows["solved by"] == ["4 of 5 seeds", "1 of 3 seeds"]
 
 
+@pytest.mark.parametrize("status", ["failed", "stopped"])
+def test_seeds_that_crashed_or_were_stopped_early_never_reached_the_threshold(status: str) -> None:
+    """Four of five end at 1,000 env steps, far below it; the fifth reaches it in its last iteration."""
+    ours = wanted("a", [1.0, 1.0, 1.0, 1.0, 20.0], threshold=11.0)
+    *short, whole = ours.data.trials
+    trials = [*(trial.model_copy(update={"status": status}) for trial in short), whole]
+    last = ours.data.results["t0004"][0].model_copy(update={"num_env_steps": 50_200})
+    data = dataclasses.replace(ours.data, trials=trials, results={**ours.data.results, "t0004": [last]})
+    found = compare([dataclasses.replace(ours, data=data), wanted("b", LEFT, threshold=11.0)])
+    rows = dict(fact_rows(found))
+    assert rows["solved by"][0] == "1 of 5 seeds"
+    assert rows["steps to 11"][0] == "not by half of the seeds"
+    # Who completed a shorter training may have reached it later.
+    shorter = dataclasses.replace(data, trials=ours.data.trials)
+    longer = compare([dataclasses.replace(ours, data=shorter), wanted("b", LEFT, threshold=11.0)])
+    assert longer.entries[0].median_env_steps == 50_200
+
+
 def test_scores_of_steps_are_told_without_a_minus() -> None:
     # The other setting says how much seeds of the second sweep differ: without it there is no difference to tell.
     both = [wanted("a", [9.0, 1.0], threshold=5.0), wanted("b", [9.0, 9.0], [9.0, 1.0], threshold=5.0)]

@@ -57,6 +57,10 @@ def test_one_that_is_as_reliable_but_slower_is_named(fast_and_slow: Synthetic) -
     unreliable = best.model_copy(update={"num_solved": 2})
     found = answer.section(source_of(fast_and_slow, settings_of(second, unreliable, worse)))
     assert "Next comes lr 0.1: 2 of 3 seeds reached 195" in " ".join(found.sentences)
+    # Of a setting of which half of the seeds do, one that did is met every second time.
+    one_seed = setting(1, ["t0000"], 1, probability_best=0.4)
+    found = answer.section(source_of(fast_and_slow, settings_of(second, one_seed, worse)))
+    assert "Next comes lr 0.1: 1 of 1 seed reached 195" in " ".join(found.sentences)
 
 
 def test_one_seed_a_setting_names_no_setting() -> None:

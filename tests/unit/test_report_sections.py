@@ -153,6 +153,16 @@ def test_next_steps_are_commands_and_sweep_files_that_can_be_launched() -> None:
     assert 1e-7 < low < settings.best.point["lr"] < high <= 1e-2
 
 
+def test_next_steps_run_failed_trials_again_unless_the_sweep_goes_on_first() -> None:
+    synthetic = ppo_sweep()
+    synthetic.trials[0] = synthetic.trials[0].model_copy(update={"status": "failed", "error": "it broke"})
+    assert steps_of(synthetic)["Retry"].text == "tune-jobs resume sweep --retry-failed"
+    synthetic.sweep = synthetic.sweep.model_copy(update={"state": "interrupted"})
+    steps = steps_of(synthetic)
+    assert steps["Go on"].text == "tune-jobs resume sweep"
+    assert "Retry" not in steps
+
+
 def test_next_steps_keep_all_arguments_of_the_environment() -> None:
     args = {"map_name": None, "x": {}, "y": {"z": None}}
     steps = steps_of(with_spec(ppo_sweep(), env={"id": "CartPole-v1", "args": args, "frame_stack": 1, "atari": None}))

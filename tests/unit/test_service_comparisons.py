@@ -69,6 +69,16 @@ def test_the_curves_are_those_of_the_trials(live: Live, stores: dict[str, SweepS
     assert found["learning"][1]["mean"][-1] == pytest.approx(33.0)
 
 
+def test_a_curve_says_how_many_seeds_it_lacks(live: Live, stores: dict[str, SweepStore]) -> None:
+    # Before its first evaluation.
+    trial = stores["two"].trial("t0002")
+    trial.write_record(trial.read_record().model_copy(update={"status": "failed", "error": "ValueError: x"}))
+    (trial.folder / "results.jsonl").unlink()
+    one, two = compared(live, "one", "two")["learning"]
+    assert (one["num_seeds"], one["num_without"]) == (2, 0)
+    assert (two["num_seeds"], two["num_without"]) == (1, 1)
+
+
 def test_only_what_differs_of_the_sweep_files_is_told(live: Live, stores: dict[str, SweepStore]) -> None:
     found = {item["path"]: item["texts"] for item in compared(live, "one", "two")["differences"]}
     assert found["space.lr"] == ["{uniform: [0.0001, 0.01]}", "{loguniform: [1.0e-05, 0.001]}"]
@@ -105,7 +115,7 @@ def test_the_policy_to_deploy_is_told_with_its_interval(live: Live, stores: dict
     stores["one"].write_best(make_best(**chosen(stores["one"]), confirmation=confirmed))
     facts = {fact["title"]: fact["cells"] for fact in compared(live, "one", "two")["facts"]}
     one, two = facts["policy to deploy"]
-    assert one == "195.0 (190.0 to 200.0 with 95 %) over 3 fresh episodes, solved"
+    assert one == "195.0 (182.6 to 207.4 with 95 %) over 3 fresh episodes, solved"
     assert two == "-"
 
 

@@ -232,7 +232,7 @@ def run_options(command: _Command) -> _Command:
         click.option(
             "--address",
             metavar="ADDRESS",
-            help="Ray cluster: auto, ray://... or http://... (as a job); without it, this machine.",
+            help="Ray cluster: auto, HOST:PORT, ray://... or http://... (as a job); without it, this machine.",
         ),
         click.option(
             "--wait-for-nodes",

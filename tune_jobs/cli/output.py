@@ -17,6 +17,7 @@ import click
 from analysis.wording import PLAIN_NONE, counted, difference_text, range_text, return_text, setting_text
 from policies.errors import TuneJobsError, fit
 from tune_jobs.cli.characters import has_all_characters
+from tune_jobs.cli.going_on import how_to_resume, notes_of
 from tune_jobs.process.interruption import last_words
 from tune_jobs.sweeps.plain import to_json
 
@@ -55,10 +56,7 @@ def show_result(result: SweepResult, *, as_json: bool) -> None:
     finally:
         # Also where nobody reads the result: Ctrl-C ends a pipe's reader too.
         if result.interrupted:
-            # Most commands that print something need no store, which takes as long to load as all else here.
-            from tune_jobs.store.opening import open_sweep, resume_command
-
-            say_interrupted(result.sweep, resume_command(open_sweep(result.place), result.sweep))
+            say_interrupted(result.sweep, how_to_resume(result))
 
 
 def _print_result(result: SweepResult, *, as_json: bool) -> None:
@@ -70,7 +68,7 @@ def _print_result(result: SweepResult, *, as_json: bool) -> None:
     made = {name: shown_path(path) for name, path in result.artifacts.items()}
     print_outcome(
         result.sweep, result.trials, best=result.best, why_no_best=result.why_no_best,
-        paths={"sweep": shown_path(result.place), **made}, notes=result.notes,
+        paths={"sweep": shown_path(result.place), **made}, notes=notes_of(result),
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ import click
 from analysis.wording import PLAIN_NONE, counted, duration, return_text, short_text
 from policies.errors import NotFoundError, SpecError, TuneJobsError, fit
 from tune_jobs.cli.base import losing_what_nobody_reads, say_left, stdout_for
+from tune_jobs.cli.going_on import retry_notes
 from tune_jobs.cli.remote import told_here
 from tune_jobs.cli.server import Server
 from tune_jobs.client.answers import Job, Summary
@@ -244,16 +245,20 @@ def _said(job: Job, unchosen: str | None) -> tuple[list[str], str | None]:
 def _show(result: dict[str, Any], server: Server, *, as_json: bool) -> int:
     from tune_jobs.cli import output
 
+    def resume() -> str:
+        return f"{server.program} resume {shlex.quote(result['sweep'].name)}"
+
     with losing_what_nobody_reads(result["interrupted"]):
         if as_json:
             output.print_json(result)
         else:
             output.print_outcome(
                 result["sweep"], result["trials"], best=result["best"], why_no_best=result["why_no_best"],
-                paths={"sweep": result["folder"], **result["artifacts"]}, notes=result["notes"],
+                paths={"sweep": result["folder"], **result["artifacts"]},
+                notes=[*result["notes"], *retry_notes(result["trials"], resume, interrupted=result["interrupted"])],
             )  # fmt: skip
     if result["interrupted"]:
         with losing_what_nobody_reads(True):  # noqa: FBT003
-            output.say_interrupted(result["sweep"], f"{server.program} resume {shlex.quote(result['sweep'].name)}")
+            output.say_interrupted(result["sweep"], resume())
     code: int = result["exit_code"]
     return code

@@ -30,7 +30,11 @@ folder_option = click.option(
 @click.command()
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any free port.")
-@click.option("--address", metavar="ADDRESS", help="Ray cluster that sweeps run on; without it, this machine.")
+@click.option(
+    "--address",
+    metavar="ADDRESS",
+    help="Ray cluster of all sweeps: auto, HOST:PORT or ray://...; without it, this machine.",
+)
 @click.option(
     "--wait-for-nodes", type=click.FloatRange(0, 10**9), default=0.0, show_default=True, metavar="SECONDS",
     help="With --address: how long sweeps wait for nodes that can hold one trial, unless their request says it.",

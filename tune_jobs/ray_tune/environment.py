@@ -22,7 +22,7 @@ _ENVIRONMENT = {
     "RAY_CHDIR_TO_TRIAL_DIR": "0",
 }
 # Read by a Ray that is started here, unless the user says otherwise. By Ray's own default of 15 its processes get 3 %
-# of a core beside anything else that runs there. Those that are forked have none of it.
+# of a core beside anything else that runs there.
 _NICENESS = "RAY_worker_niceness", "0"
 # Set as a Ray is started, see `local_ray`.
 _USAGE = "RAY_USAGE_STATS_ENABLED"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 
-if __name__ == "__main__":
+if __name__ == "__main__" and not sys.flags.safe_path:
     # The folder of this file, in which names of others would be found.
     del sys.path[0]
 
@@ -121,11 +121,15 @@ def _fork(kernel: ctypes.CDLL, connection: socket.socket) -> int:
 
 def _import(*modules: str) -> None:
     root = str(Path(__file__).parents[2])
-    sys.path.insert(0, root)
+    # Where packages are installed, it stands behind Python's own modules, whose names some packages bear.
+    is_found = root in sys.path
+    if not is_found:
+        sys.path.insert(0, root)
     for name in modules:
         with contextlib.suppress(Exception):
             importlib.import_module(name)
-    sys.path.remove(root)
+    if not is_found:
+        sys.path.remove(root)
 
 
 def _settings_of_ray(asked: Mapping[str, Any]) -> dict[str, str]:
@@ -200,7 +204,8 @@ def _work(asked: Mapping[str, Any], streams: list[int]) -> None:
         os.close(stream)
     gc.enable()
     _take_over_signals(asked)
-    os.chdir(asked["folder"])
+    if asked["folder"] is not None:
+        os.chdir(asked["folder"])
     os.environ.clear()
     os.environ.update(asked["environment"])
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
@@ -212,7 +217,9 @@ def _work(asked: Mapping[str, Any], streams: list[int]) -> None:
     program, *options = asked["command"]
     sys.argv[:] = [program, *options]
     # As Python does when it starts; the folders of the user's modules come to PYTHONPATH after this process began.
-    sys.path[:0] = [os.path.dirname(program), *(part for part in given if part and part not in sys.path)]  # noqa: PTH120
+    sys.path[:0] = [part for part in given if part and part not in sys.path]
+    if not sys.flags.safe_path:
+        sys.path.insert(0, os.path.dirname(program))  # noqa: PTH120
     numpy = sys.modules.get("numpy")
     if numpy is not None:
         # As Python's own generator is, so that processes do not draw the same.

@@ -46,12 +46,16 @@ def forkable(command: list[str]) -> list[str] | None:
 def ask(address: str, command: list[str]) -> bool:
     """Ask for a process; return whether there is one."""
     score = ""
+    folder = None
+    with contextlib.suppress(OSError):
+        folder = str(Path.cwd())
     with contextlib.suppress(OSError):
         score = Path("/proc/self/oom_score_adj").read_text(encoding="ascii")
     asked = {
         "command": command,
         "environment": dict(os.environ),
-        "folder": str(Path.cwd()),
+        # None: it was removed, and what is forked is in no other.
+        "folder": folder,
         "blocked": [int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])],
         "ignored": [
             int(number)

@@ -160,7 +160,7 @@ class ObjectiveSpec(Section):
         "final",
         description="final: the later half of its training, three parts evaluations and one part training episodes; "
         "area: the mean evaluation over all of it; best: its best evaluation; steps_to_threshold: the env steps to the "
-        "first evaluation that reaches the threshold.",
+        "first evaluation that reaches the threshold, and twice those of the longest training where none does.",
     )
     threshold: Number | None = Field(None, description="steps_to_threshold: the return to reach; null: the env's own.")
     cost: Cost | None = Field(

@@ -15,7 +15,7 @@ from analysis.comparison.compare import compare as compare_all
 from analysis.comparison.entries import Entry, Wanted, judged_alike
 from analysis.comparison.wording import fact_rows, pair_lines
 from analysis.exports.frames import ranked_settings
-from analysis.statistics import mean_with_ci
+from analysis.statistics import episodes_interval
 from analysis.wording import PLAIN_NONE, counted, interval_text, return_text
 from policies import random_streams
 from policies.errors import NotFoundError, SpecError
@@ -54,6 +54,9 @@ class Learning:
 
     letter: str
     num_seeds: int
+    """Those that it is of."""
+    num_without: int
+    """Seeds that showed no such return, as those that failed before their first evaluation; it is not of them."""
     num_env_steps: tuple[float, ...]
     """Env steps of a trial."""
     mean: tuple[float, ...]
@@ -159,7 +162,7 @@ def _policy_text(store: Sweep) -> str:
     text = return_text(confirmed.mean_return)
     # Episodes that are all alike say nothing of how others would differ.
     if len(set(confirmed.returns)) > 1:
-        interval = mean_with_ci(confirmed.returns, rng=random_streams.fixed())
+        interval = episodes_interval(confirmed.returns, rng=random_streams.fixed())
         text += f" ({interval_text(interval)} with 95 %)"
     solved = "" if confirmed.solved is None else ", solved" if confirmed.solved else ", not solved"
     return f"{text} over {counted(confirmed.num_episodes, 'fresh episode')}{solved}"
@@ -182,4 +185,4 @@ def _learning(entry: Entry, wanted: Wanted, *, evaluated: bool) -> Learning | No
         low, high = np.clip([curve.lower, curve.upper], curve.least, curve.most)
         lower, upper = tuple(low.tolist()), tuple(high.tolist())
     steps, mean = curve.num_env_steps.tolist(), curve.mean.tolist()
-    return Learning(entry.letter, curve.num_seeds, tuple(steps), tuple(mean), lower, upper)
+    return Learning(entry.letter, curve.num_seeds, curve.num_without, tuple(steps), tuple(mean), lower, upper)

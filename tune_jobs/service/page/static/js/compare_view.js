@@ -159,6 +159,9 @@ function showBest(chart, { comparison: { entries }, best_so_far: all, returns, g
   });
 }
 
+const seedsOf = ({ num_seeds: shown, num_without: without }) =>
+  `${without ? `${count(shown)} of ` : ""}${counted(shown + without, "seed")}`;
+
 function showCurves(chart, { comparison: { entries }, learning, returns, goal }) {
   const lines = learning.map((curve) => {
     const entry = entries.find((known) => known.letter === curve.letter);
@@ -171,16 +174,25 @@ function showCurves(chart, { comparison: { entries }, learning, returns, goal })
       y: curve.mean,
       low: curve.lower,
       high: curve.upper,
-      more: () => [`${counted(curve.num_seeds, "seed")}${range}`],
+      more: () => [`${seedsOf(curve)}${range}`],
     };
   });
   const missing = entries.filter((entry) => !learning.some((curve) => curve.letter === entry.letter));
   const without = missing.map((entry) => `${entry.letter} has none: ${entry.why_none || "no such returns"}.`).join(" ");
+  const short = learning.filter((curve) => curve.num_without);
+  const fewer = short.map((curve) => `${curve.letter} is of ${seedsOf(curve)}.`).join(" ");
   const what = returns === "evaluation" ? "greedy evaluation" : "training return";
   chart.show({
     lines,
     goal,
-    caption: `Mean ${what} of each one's leading setting over its training seeds; bands are 95 % intervals. ${without}`.trim(),
+    caption: [
+      `Mean ${what} of each one's leading setting over its training seeds; a seed that ended early is held at its last`,
+      "value, and one that failed before it showed any is left out. Bands are 95 % intervals.",
+      fewer,
+      without,
+    ]
+      .filter(Boolean)
+      .join(" "),
     none: "No setting has been judged yet.",
   });
 }
