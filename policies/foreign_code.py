@@ -5,11 +5,12 @@ The names are those of `policies.foreign_names`; the values are computed where t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from policies.foreign_envs import NO_IMAGES, env_kwargs, known_env, sb3_env
+from policies.foreign_envs import env_kwargs, known_env, rllib_env, sb3_env
 from policies.foreign_phases import rllib_phase, rllib_target, sb3_phase, sb3_target
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.schedules import linear
@@ -115,8 +116,7 @@ def rllib_program(
         env_args: Keyword arguments of the environment.
         flattens: Whether the env's own observations, neither vectors nor images, are to be made such.
     """
-    env = known_env(env_id)
-    env_id, imports, registration = env.env_id, list(env.imports), list(env.registration)
+    env = rllib_env(values, known_env(env_id), flattens=flattens)
     arguments, notes = _rllib_ppo(values) if isinstance(values, PPOHyperparams) else _rllib_dqn(values)
     name = "PPO" if isinstance(values, PPOHyperparams) else "DQN"
     activation = "GELU" if values.activation == "gelu" else values.activation
@@ -144,41 +144,28 @@ def rllib_program(
     schedule = values.lr if values.lr_final is None else [[0, values.lr], [values.lr_decay_steps, values.lr_final]]
     # RLlib's DQN clips at 40 if it isn't told.
     training = {"lr": schedule, "gamma": values.gamma, "grad_clip": values.grad_clip, **arguments}
-    if flattens and values.conv_filters is None:
-        # RLlib has no argument for an env's wrapper, and its layers take no whole numbers.
-        imports = [
-            *dict.fromkeys([*imports, "import gymnasium"]),
-            "import numpy",
-            "from gymnasium.wrappers import DtypeObservation, FlattenObservation",
-            "from ray.tune import register_env",
-        ]
-        made = f"DtypeObservation(FlattenObservation(gymnasium.make({env_id!r}, **config)), numpy.float32)"
-        registration += [f'register_env("flattened", lambda config: {made})', ""]
-        env_id = "flattened"
-    elif flattens:
-        notes.append(NO_IMAGES)
     chain = [
-        f".environment({env_id!r}{env_kwargs('env_config', env_args)})",
+        f".environment({env.env_id!r}{env_kwargs('env_config', env_args)})",
         _call(".env_runners", [], runners),
         ".learners(num_learners=0)",
         _call(".training", [], training),
         f".rl_module(model_config={_call('DefaultModelConfig', [], model)})",
     ]
     body = "\n".join(f"    {line}" for part in chain for line in part.splitlines())
-    imports += [
+    imports = [
+        *env.imports,
         f"from ray.rllib.algorithms.{name.lower()} import {name}Config",
         "from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig",
     ]
     made = f"config = (\n    {name}Config()\n{body}\n)\nalgorithm = config.build_algo()"
-    code = "\n".join([*imports, "", *registration, made])
+    code = "\n".join([*imports, "", *env.registration, made])
     return ForeignProgram(code, (*env.notes, *notes))
 
 
 def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
-    notes = []
-    n_steps = max(1, round(values.train_batch_size / values.num_envs))
-    if n_steps * values.num_envs != values.train_batch_size:
-        notes.append(f"The train batch is {n_steps * values.num_envs} env steps, not {values.train_batch_size}.")
+    # Ours samples whole vector steps too, and the batch at least.
+    n_steps = math.ceil(values.train_batch_size / values.num_envs)
+    notes = _sb3_minibatches(values, n_steps * values.num_envs)
     if values.entropy_coeff_final is not None:
         notes.append("entropy_coeff stays at its first value: SB3 has no schedule for ent_coef.")
     if values.clip_param_final is not None:
@@ -204,6 +191,21 @@ def _sb3_ppo(values: PPOHyperparams) -> tuple[dict[str, Any], list[str]]:
         **({} if values.vf_clip_range is None else {"clip_range_vf": values.vf_clip_range}),
         **({} if values.normalize_advantages else {"normalize_advantage": False}),
     }, notes
+
+
+def _sb3_minibatches(values: PPOHyperparams, num_rows: int) -> list[str]:
+    """Return notes on what SB3 does otherwise with minibatches of a train batch of so many env steps."""
+    size, notes = values.minibatch_size, []
+    if values.normalize_advantages and size < num_rows:
+        notes.append("SB3 standardises advantages over each minibatch, ours over the whole train batch.")
+    if rest := num_rows % size:
+        theirs = values.num_epochs * math.ceil(num_rows / size)
+        ours = math.ceil(values.num_epochs * num_rows / size)
+        notes.append(
+            f"Updates per train batch: SB3 {theirs}, the last of each epoch with {rest} env steps, "
+            f"ours {ours}, each with {size}."
+        )
+    return notes
 
 
 def _sb3_continuous(values: PPOHyperparams) -> str:

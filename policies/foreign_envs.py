@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from policies.envs.atari import is_atari_id
@@ -12,10 +12,24 @@ from policies.hyperparams import PPOHyperparams, TrainedHyperparams
 
 NO_IMAGES = "The env's own observations are no images, as the convolutions need: wrap it."
 
+_SCALED = """\
+def scaled(config):
+    env = MADE
+    space = env.observation_space
+    if space.dtype != numpy.uint8:
+        return env
+    largest = max(1, int(space.high.max()))
+    numbers = gymnasium.spaces.Box(0, 1, space.shape)
+    return TransformObservation(env, lambda image: numpy.float32(image) / largest, numbers)
+
+
+register_env("scaled", scaled)"""
+"""Code that registers an env whose images of bytes are of 0 to 1, as ours are seen (`scale_of_bytes`)."""
+
 
 @dataclass(frozen=True)
 class KnownEnv:
-    """An environment that Gymnasium knows once the lines were run."""
+    """An environment that Gymnasium, or RLlib, knows once the lines were run."""
 
     env_id: str
     """The id by which it does."""
@@ -101,6 +115,37 @@ def sb3_env(values: TrainedHyperparams, env: KnownEnv, env_args: Mapping[str, An
         norm_reward = f"gamma={values.gamma!r}" if scales else "norm_reward=False"
         lines += [f"env = VecNormalize(env{norm_obs}, {norm_reward})"]
     return MadeEnv(tuple(imports), tuple(lines), tuple(notes))
+
+
+def rllib_env(values: TrainedHyperparams, env: KnownEnv, *, flattens: bool) -> KnownEnv:
+    """Return a setting's environment as RLlib takes it, which has no argument for an env's wrapper.
+
+    RLlib's layers take floating-point numbers alone, and it neither converts nor scales what an env observes.
+
+    Args:
+        values: The setting.
+        env: The environment.
+        flattens: Whether its own observations, neither vectors nor images, are to be made such.
+    """
+    has_images = values.conv_filters is not None
+    if flattens and has_images:
+        return replace(env, notes=(*env.notes, NO_IMAGES))
+    if not flattens and not has_images:
+        return env
+    made = f"gymnasium.make({env.env_id!r}, **config)"
+    if has_images:
+        name, wrappers, lines = "scaled", "TransformObservation", _SCALED.replace("MADE", made)
+    else:
+        name, wrappers = "flattened", "DtypeObservation, FlattenObservation"
+        wrapped = f"DtypeObservation(FlattenObservation({made}), numpy.float32)"
+        lines = f'register_env("flattened", lambda config: {wrapped})'
+    imports = (
+        *dict.fromkeys([*env.imports, "import gymnasium"]),
+        "import numpy",
+        f"from gymnasium.wrappers import {wrappers}",
+        "from ray.tune import register_env",
+    )
+    return KnownEnv(name, imports, (*env.registration, lines, ""), env.notes)
 
 
 def env_kwargs(name: str, env_args: Mapping[str, Any]) -> str:

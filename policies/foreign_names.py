@@ -138,9 +138,15 @@ _EPSILON = "epsilon: [[0, a], [n, b]] is epsilon_initial a, epsilon_decay n, eps
 _DQN: tuple[ForeignName, ...] = (
     ForeignName(SB3, "normalize", ("normalize_observations",), "of RL Zoo; rewards are normalised with ppo alone"),
     ForeignName(SB3, "buffer_size", ("replay_capacity",)),
-    ForeignName(SB3, "learning_starts", ("learning_starts",)),
+    ForeignName(
+        SB3, "learning_starts", ("learning_starts",), "SB3's actions are all random until then, ours as epsilon says"
+    ),
     ForeignName(SB3, "batch_size", ("train_batch_size",)),
-    ForeignName(SB3, "tau", ("tau",)),
+    ForeignName(
+        SB3, "tau", ("tau",),
+        "SB3 moves the target at each target_update_interval, also between updates: set target_update_freq, and tau to "
+        "1 - (1 - SB3's tau) ^ (target_update_freq / target_update_interval)",
+    ),
     ForeignName(
         SB3, "train_freq", ("train_freq",),
         "SB3 counts steps of all environments at once, we count each: train_freq is SB3's x n_envs",
@@ -150,7 +156,10 @@ _DQN: tuple[ForeignName, ...] = (
         "updates_per_env_step is gradient_steps / (SB3's train_freq x n_envs), and 1 for gradient_steps -1",
     ),
     ForeignName(SB3, "n_steps", ("n_step",)),
-    ForeignName(SB3, "target_update_interval", ("target_update_freq",)),
+    ForeignName(
+        SB3, "target_update_interval", ("target_update_freq",),
+        "SB3 updates it between training phases alone: target_update_freq is at least SB3's train_freq x n_envs",
+    ),
     ForeignName(
         SB3, "exploration_fraction", ("epsilon_decay",),
         "epsilon_decay is in env steps: exploration_fraction x SB3's total_timesteps (here stop.num_env_steps)",
@@ -173,8 +182,16 @@ _DQN: tuple[ForeignName, ...] = (
         "of the old API stack; the new one adds nothing, and no |TD error| is less than 1e-12",
     ),
     ForeignName(RLLIB, "num_steps_sampled_before_learning_starts", ("learning_starts",)),
-    ForeignName(RLLIB, "target_network_update_freq", ("target_update_freq",)),
-    ForeignName(RLLIB, "tau", ("tau",)),
+    ForeignName(
+        RLLIB, "target_network_update_freq", ("target_update_freq",),
+        "RLlib updates it once in a training phase at most: target_update_freq is RLlib's, rounded up to a multiple of "
+        "train_freq; 0 there is after each update",
+    ),
+    ForeignName(
+        RLLIB, "tau", ("tau",),
+        "RLlib moves the target at each target_network_update_freq: set target_update_freq, without which a tau below "
+        "1 acts after each update here",
+    ),
     ForeignName(
         RLLIB, "training_intensity", ("updates_per_env_step",),
         "RLlib counts replayed transitions: updates_per_env_step is training_intensity / train_batch_size",

@@ -3,12 +3,15 @@
 import importlib.util
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
+from policies.envs.images import scale_of_bytes
 from policies.foreign_code import rllib_program
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 from policies.networks.epsilon import EpsilonSchedule
@@ -75,6 +78,54 @@ def test_layers_after_convolutions_are_ours(values: TrainedHyperparams) -> None:
     name, num_networks = ("Tanh", 2) if isinstance(values, PPOHyperparams) else ("ELU", 1)
     assert layers.count(name) == 3 * num_networks
     assert "ReLU" not in layers
+
+
+class Images(gym.Env[Any, Any]):
+    """Shows an image whose numbers are the largest of its space.
+
+    Args:
+        largest: That number.
+        dtype: The type of the numbers.
+    """
+
+    def __init__(self, largest: int, dtype: str) -> None:
+        self.image = np.full((16, 16, 3), largest, dtype)
+        self.observation_space = gym.spaces.Box(0, largest, self.image.shape, self.image.dtype.type)
+        self.action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.image, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.image, 1.0, False, True, {}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        PPOHyperparams(num_envs=2, train_batch_size=8, minibatch_size=8, num_epochs=1),
+        DQNHyperparams(learning_starts=0, train_batch_size=4, replay_capacity=64, env_steps_per_iteration=8),
+    ],
+    ids=type,
+)
+@pytest.mark.parametrize(("largest", "dtype"), [(255, "uint8"), (1, "uint8"), (7, "float32")])
+def test_convolutions_see_images_of_bytes_as_ours_do(values: TrainedHyperparams, largest: int, dtype: str) -> None:
+    values = values.model_copy(update={"conv_filters": ((4, 3, 2),), "hidden_sizes": (8,)})
+    env_args = {"largest": largest, "dtype": dtype}
+    gym.register("Images-v0", partial(Images))
+    names: dict[str, Any] = {}
+    try:
+        exec(rllib_program(values, env_id="Images-v0", env_args=env_args).code, names)
+        algorithm = names["algorithm"]
+        assert algorithm.train()["num_env_steps_sampled_lifetime"] > 0
+        seen, _ = algorithm.env_runner.env.reset()
+        algorithm.stop()
+    finally:
+        del gym.registry["Images-v0"]
+    own = Images(largest, dtype)
+    assert np.all(seen == own.image * np.float32(scale_of_bytes(own.observation_space)))
+    assert seen.dtype == np.float32
 
 
 def test_soft_target_updates_follow_every_update_and_adam_is_torchs() -> None:

@@ -18,6 +18,7 @@ from analysis.page import next_steps
 from policies.foreign_code import rllib_program, stable_baselines3_program
 from policies.hyperparams import DQNHyperparams, PPOHyperparams, TrainedHyperparams
 
+MINIBATCHES = "SB3 standardises advantages over each minibatch, ours over the whole train batch."
 SMALL = PPOHyperparams(hidden_sizes=(4,), num_envs=2, train_batch_size=32, minibatch_size=16)
 PACKAGE = """
 import gymnasium as gym
@@ -109,7 +110,7 @@ def test_sb3_finds_an_env_of_an_installed_package(tmp_path: Path) -> None:
         "    programs.append(stable_baselines3_program(values, env_id=env_id, env_args={}, num_env_steps=2))\n"
         "    rllib = rllib_program(values, env_id=env_id, env_args={}, flattens=True)\n"
         "    assert 'import its_envs' in rllib.code and 'import gymnasium\\n' in rllib.code\n"
-        "    assert programs[-1].notes == rllib.notes == ()\n"
+        f"    assert programs[-1].notes == ({MINIBATCHES!r},) and rllib.notes == ()\n"
         "    assert programs[-1].code.count('its_envs.register') == rllib.code.count('its_envs.register') == 1\n"
         "assert 'its_envs' not in sys.modules\n"
         "for program in programs:\n"
@@ -126,8 +127,9 @@ def test_packages_of_which_one_registers_an_env_are_told(tmp_path: Path) -> None
     told = run(
         "from policies.foreign_code import stable_baselines3_program\n"
         "from policies.hyperparams import PPOHyperparams\n"
+        "values = PPOHyperparams(normalize_advantages=False)\n"
         "for env_id in ('FromAPackage-v0', 'CartPole-v1', 'CartPole', 'phys2d/CartPole-v1'):\n"
-        "    program = stable_baselines3_program(PPOHyperparams(), env_id=env_id, env_args={}, num_env_steps=2)\n"
+        "    program = stable_baselines3_program(values, env_id=env_id, env_args={}, num_env_steps=2)\n"
         "    print(program.notes, [line for line in program.code.splitlines() if '_envs.' in line])\n",
         tmp_path,
     ).splitlines()
@@ -159,7 +161,7 @@ def test_sb3s_convolutions_see_the_bytes_of_images(values: TrainedHyperparams, i
         PPOHyperparams(normalize_observations=True), env_id="E", env_args={}, num_env_steps=1
     )
     assert "env = VecNormalize(env, norm_reward=False)" in plain.code
-    assert plain.notes == ()
+    assert plain.notes == (MINIBATCHES,)
 
 
 def test_the_least_images_that_sb3s_convolutions_take_are_told(images: str) -> None:

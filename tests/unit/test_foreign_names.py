@@ -89,8 +89,26 @@ def test_a_foreign_name_under_dqn_is_answered_with_ours(name: str, answer: str) 
 
 def test_dqns_target_network_is_updated_by_the_name_of_the_field() -> None:
     # The model has a property of SB3's name, which is no field.
-    answer = "Did you mean 'target_update_freq'? That is SB3's target_update_interval."
+    answer = (
+        "Did you mean 'target_update_freq'? That is SB3's target_update_interval; SB3 updates it between training "
+        "phases alone: target_update_freq is at least SB3's train_freq x n_envs."
+    )
     assert answer in errors(base=DQN, hyperparams={"target_update_interval": 1})
+
+
+@pytest.mark.parametrize(
+    ("library", "name", "difference"),
+    [
+        ("SB3", "tau", "tau to 1 - (1 - SB3's tau) ^ (target_update_freq / target_update_interval)"),
+        ("RLlib", "tau", "set target_update_freq, without which a tau below 1 acts after each update"),
+        ("RLlib", "target_network_update_freq", "rounded up to a multiple of train_freq"),
+        ("SB3", "learning_starts", "SB3's actions are all random until then"),
+    ],
+)
+def test_dqns_names_that_mean_something_else_there_are_told(library: str, name: str, difference: str) -> None:
+    (found,) = [row for row in FOREIGN_NAMES["dqn"] if (row.library, row.name) == (library, name)]
+    assert difference in found.difference
+    assert difference in " ".join(run("dqn").split())
 
 
 def test_a_foreign_name_in_set_is_answered_too() -> None:

@@ -1,5 +1,6 @@
 """A trial's log, of whichever machine: what every store promises of it, and `reproduce`, which reads it."""
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -54,3 +55,17 @@ def test_without_a_log_there_is_no_file(trial: Trial) -> None:
     trial.write_record(make_trial())
     assert not trial.newest_log().exists()
     assert continued_from(trial.newest_log()) is None
+
+
+def test_a_log_may_be_larger_than_the_memory(tmp_path: Path) -> None:
+    log, filler = tmp_path / "log.txt", "an environment prints \N{SNOWMAN}\n" * 50_000
+    log.write_text(
+        f"{filler}-- trial t0000, process 7: built from checkpoint 000012\n{filler}"
+        f"half a line-- trial t0000, process 8: built from checkpoint 000009\n{filler}"
+    )
+    tracemalloc.start()
+    try:
+        assert continued_from(log) == 9
+        assert tracemalloc.get_traced_memory()[1] < log.stat().st_size / 10
+    finally:
+        tracemalloc.stop()

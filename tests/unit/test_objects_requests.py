@@ -24,6 +24,8 @@ from tune_jobs.store.objects.object_sweep import ObjectSweep
 from tune_jobs.store.objects.object_trial import ObjectTrial
 from tune_jobs.store.objects.url import ObjectUrl
 from tune_jobs.store.opening import others_write
+from tune_jobs.sweeps.attach import _Look
+from tune_jobs.sweeps.status import list_sweeps
 
 NUM_TRIALS = 3
 
@@ -85,6 +87,46 @@ def test_a_service_looks_at_all_sweeps_of_a_list_side_by_side(faults: Faults, ur
         faults.rule("slow", kinds="GET", keys="/driver-lock.json$", times=NUM_TRIALS, then=all_came.wait)
         assert [seen.name for seen in statuses.all()] == wanted
         assert not all_came.broken
+
+
+def test_sweeps_are_listed_side_by_side(faults: Faults, url: ObjectUrl, caplog: pytest.LogCaptureFixture) -> None:
+    storage, wanted = ObjectStorage(url), [f"s{index}" for index in range(NUM_TRIALS)]
+    for name in wanted:
+        storage.sweep(name).write_record(make_sweep(name=name, state="completed"))
+    all_came = threading.Barrier(NUM_TRIALS, timeout=30)
+    faults.rule("slow", kinds="GET", keys="/driver-lock.json$", times=NUM_TRIALS, then=all_came.wait)
+    assert [seen.sweep.name for seen in list_sweeps(storage.place)] == wanted
+    assert not all_came.broken
+    # One that is damaged is told, and the others are listed.
+    storage.sweep("s1")._bucket.put(names.SWEEP_RECORD, b"half a record")
+    assert [seen.sweep.name for seen in list_sweeps(storage.place)] == ["s0", "s2"]
+    assert "Left out: " in caplog.text
+
+
+def test_records_that_were_written_since_are_read_side_by_side(
+    faults: Faults, opened: Opened, url: ObjectUrl, sweep: ObjectSweep
+) -> None:
+    writer, all_came = opened(), threading.Barrier(NUM_TRIALS, timeout=30)
+    writer.write_record(make_sweep(state="interrupted"))
+    statuses, look = Statuses(ObjectStorage(url.parent)), _Look(sweep)
+
+    def wait_for_all() -> None:
+        faults.rule("slow", kinds="GET", keys="/records/", times=NUM_TRIALS, then=all_came.wait)
+
+    wait_for_all()
+    assert statuses.see(url.name).status.counts == {"pending": NUM_TRIALS}
+    for index in range(NUM_TRIALS):
+        writer.trial(f"t{index:04d}").write_record(make_trial(index, status="completed"))
+    writer._bucket.put("records/t0001.json", b"half a record")
+    # Of a sweep whose own record is as it was, the status of a moment ago would do.
+    writer.write_record(make_sweep(state="completed"))
+    wait_for_all()
+    assert statuses.see(url.name).status.counts == {"completed": NUM_TRIALS - 1}
+    # Whoever attaches to it, too, has the others of one that is damaged.
+    wait_for_all()
+    look.update()
+    assert look.monitor.counts() == {"completed": NUM_TRIALS - 1, "pending": 1}
+    assert not all_came.broken
 
 
 def test_records_that_this_process_has_written_are_not_fetched(faults: Faults, sweep: ObjectSweep) -> None:

@@ -245,7 +245,8 @@ def test_programs_of_other_libraries_have_the_values_under_their_names(algorithm
     if algorithm == "ppo":
         assert "n_steps=64," in sb3.code  # of each of eight environments
         assert 'vf_clip_param=float("inf")' in rllib.code
-        assert sb3.notes == rllib.notes == ()
+        assert sb3.notes == ("SB3 standardises advantages over each minibatch, ours over the whole train batch.",)
+        assert rllib.notes == ()
     else:
         assert "train_freq=2," in sb3.code
         assert "gradient_steps=4," in sb3.code
@@ -260,8 +261,10 @@ def test_what_other_libraries_lack_is_told() -> None:
         train_batch_size=1000, num_envs=7, minibatch_size=100,
     )  # fmt: skip
     program = stable_baselines3_program(values, env_id="E", env_args={}, num_env_steps=2_000)
-    assert len(program.notes) == 6
-    assert "The train batch is 1001 env steps, not 1000." in program.notes
+    assert len(program.notes) == 7
+    # Ours samples as many, in whole vector steps.
+    assert "n_steps=143," in program.code
+    assert not any("The train batch" in note for note in program.notes)
     assert "VecNormalize(env, norm_reward=False)" in program.code
     for values, arguments in (
         (PPOHyperparams(normalize_rewards=True, gamma=0.9), "norm_obs=False, gamma=0.9"),

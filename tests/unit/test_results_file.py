@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+from store_parts import Reopen
 
 from analysis.records import IterationRecord
+from tune_jobs.store.contract import Sweep
 from tune_jobs.store.trial_store import TrialStore
 
 
@@ -58,3 +60,39 @@ def test_counts_in_results_are_not_negative(trial: TrialStore, caplog: pytest.Lo
     trial.results_path.write_text("\n".join([json.dumps(json.loads(first) | {field: -1}), *others, ""]))
     assert trial.read_iterations() == lines_of(2, 3)
     assert "line 1 is no result" in caplog.text
+
+
+@pytest.mark.parametrize("after", [0, 2, 4, 6])
+@pytest.mark.parametrize(
+    "numbers",
+    [(1, 2, 10**9, 4, 5, 6), (1, 2, (3, 10**12), 4, 5, 6), (10**9, 5), (1, 2, 3, 2, 3, 4, 5), (3, (4, 1), 5), (6, 5)],
+)
+def test_the_iterations_after_one_are_the_same_as_of_all(
+    trial: TrialStore, numbers: tuple[int | tuple[int, int], ...], after: int
+) -> None:
+    trial.keep_iterations(lines_of(*numbers))
+    assert trial.read_iterations(after) == [record for record in trial.read_iterations() if record.iteration > after]
+
+
+def test_of_the_iterations_up_to_that_one_only_the_beginning_is_read(
+    trial: TrialStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    trial.keep_iterations(lines_of(1, 2, 3, 4))
+    lines = trial.results_path.read_text().splitlines()
+    for index in (1, 2):
+        lines[index] = lines[index].replace('"num_episodes":', "?")
+    trial.results_path.write_text("\n".join([*lines, ""]))
+    assert trial.read_iterations(2) == lines_of(4)
+    assert ["line 3 is no result" in message for message in caplog.messages] == [True]
+    assert trial.read_iterations() == lines_of(1, 4)
+
+
+def test_every_store_reads_those_after_one(sweep: Sweep, another: Reopen) -> None:
+    trial = sweep.trial("t0000")
+    assert trial.read_iterations(2) == []
+    trial.append_iterations(lines_of(1, 2, 3, 4))
+    trial.settle()
+    found = another().trial("t0000")
+    assert found.read_iterations(2) == found.read_results(2).records == lines_of(3, 4)
+    assert found.read_iterations(4) == []
+    assert found.read_iterations() == lines_of(1, 2, 3, 4)

@@ -3,8 +3,11 @@
 import gc
 import gzip
 import json
+import threading
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from policy_factory import make_portable
@@ -13,6 +16,7 @@ from sweep_folders import chosen, make_sweep_folder
 
 from tests.narrowing import present
 from tune_jobs.service import derived as module
+from tune_jobs.service.busy import BusyError, without_waiting
 from tune_jobs.service.derived import Derived
 from tune_jobs.service.statuses import Statuses
 from tune_jobs.store.opening import open_storage
@@ -65,6 +69,30 @@ def test_objects_count_by_what_they_hold(derived: Derived) -> None:
     small = derived.num_bytes
     derived.comparison(["a", "b"])
     assert 100 < small < derived.num_bytes < 10**6
+
+
+def test_what_is_kept_is_told_while_something_else_is_made(derived: Derived, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept, began, may_end = derived.trials_csv("a"), threading.Event(), threading.Event()
+
+    def slow(_: Any) -> str:
+        began.set()
+        assert may_end.wait(60)
+        return "made"
+
+    monkeypatch.setattr("tune_jobs.sweeps.exports.trials_csv", slow)
+    with ThreadPoolExecutor(3) as pool:
+        try:
+            made = pool.submit(derived.trials_csv, "b")
+            assert began.wait(30)
+            assert pool.submit(derived.trials_csv, "a").result(10) is kept
+            # Whoever does not want to wait is told that there is something to wait for.
+            with without_waiting(), pytest.raises(BusyError):
+                derived.trials_csv("c")
+            also_made = pool.submit(derived.trials_csv, "b")
+        finally:
+            may_end.set()
+        assert made.result(30) == "made"
+        assert also_made.result(30) is made.result()
 
 
 def test_trials_of_a_sweep_that_is_gone_are_not_kept(derived: Derived, statuses: Statuses) -> None:

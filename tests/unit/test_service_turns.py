@@ -6,16 +6,19 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 from live_service import Live, live, serving, wait_until  # noqa: F401 (a fixture)
 from services import FAKE
+from sweep_folders import make_sweep_folder
 
+from tune_jobs.service.derived import Derived
 from tune_jobs.service.http.models import NewSweep
 from tune_jobs.service.turns import Turns
+from tune_jobs.service.views import SweepView
 
 # ruff: noqa: F811 - fixtures are named as arguments
 MANY = 60
@@ -144,6 +147,91 @@ def test_a_request_that_is_wrong_gives_its_turn_back(live: Live) -> None:
         for _ in range(3):
             assert ask(live, "POST", "/api/v1/plans", body)[0] == 422
     assert plan(live)[0] == 200
+
+
+# -- what is made of whole sweeps, and looked at
+
+
+def ask_all(live: Live, pool: ThreadPoolExecutor, path: str) -> list[Future[int]]:
+    """Ask for something many times at once; all requests are there when it returns."""
+    asked = [pool.submit(lambda: live.get(path).status_code) for _ in range(MANY)]
+    wait_until(lambda: len(live.server.server_state.connections) == MANY)
+    return asked
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/sweeps/a/importance", "/sweeps/a/what-mattered", "/sweeps/a/front", "/sweeps/a/trials.csv", "/sweeps/a/file",
+        "/sweeps/a/records", "/comparison?source=a&source=b", "/comparisons?sweeps=a,b",
+    ],
+)  # fmt: skip
+def test_whoever_asks_for_what_is_being_made_leaves_threads_for_the_others(
+    live: Live, path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a", "b"):
+        make_sweep_folder(live.storage / name)
+    assert live.get("/sweeps/b/importance").status_code == 200
+    make, held = Derived._make, Gate()
+
+    def slow(*args: Any) -> Any:
+        held.wait()
+        return make(*args)
+
+    monkeypatch.setattr(Derived, "_make", slow)
+    with ThreadPoolExecutor(MANY) as pool:
+        try:
+            asked = ask_all(live, pool, path)
+            wait_until(lambda: held.num_came == 1)
+            assert is_answered(live)
+            # It is kept, and nothing has to be made for it.
+            assert ask(live, "GET", "/api/v1/sweeps/b/importance", timeout_s=10)[0] == 200
+        finally:
+            held.opened.set()
+        assert {answer.result() for answer in asked} == {200}
+    assert held.num_came == 1
+
+
+def test_whoever_asks_for_a_sweep_that_is_looked_at_leaves_threads_for_the_others(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_sweep_folder(live.storage / "a")
+    changes, held = SweepView.changes, Gate()
+
+    def slow(view: SweepView) -> Any:
+        held.wait()
+        return changes(view)
+
+    monkeypatch.setattr(SweepView, "changes", slow)
+    with ThreadPoolExecutor(MANY) as pool:
+        try:
+            asked = ask_all(live, pool, "/sweeps/a/curves")
+            wait_until(lambda: held.num_came >= 1)
+            assert is_answered(live)
+            # Of many that come at once, one looks.
+            assert held.num_came == 1
+        finally:
+            held.opened.set()
+        assert {answer.result() for answer in asked} == {200}
+    assert len(live.service.watching._watches) == 1
+
+
+def test_a_stream_waits_for_no_later_look_at_its_sweep(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_sweep_folder(live.storage / "a")
+    assert live.get("/sweeps/a/curves").status_code == 200
+    changes, held = SweepView.changes, Gate()
+
+    def slow(view: SweepView) -> Any:
+        held.wait()
+        return changes(view)
+
+    monkeypatch.setattr(SweepView, "changes", slow)
+    try:
+        wait_until(lambda: held.num_inside == 1)
+        with live.events("/sweeps/a/events") as events:
+            wait_until(lambda: events.status == 200)
+    finally:
+        held.opened.set()
 
 
 # -- turns

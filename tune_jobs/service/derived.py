@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType, ref
 
-from tune_jobs.service.statuses import Statuses, Trials
+from tune_jobs.service.busy import held
+from tune_jobs.service.statuses import Seen, Statuses, Trials
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.sweeps.plain import to_json
 from tune_jobs.sweeps.status import SweepStatus
@@ -29,6 +30,10 @@ _MOST_BYTES = 256 * 2**20
 """What is kept of all, besides the last, which may be larger; a sweep as one file has at most so many."""
 _BYTES_OF_JSON = 8
 """What one character of JSON takes as objects, about."""
+
+
+_Key = tuple[str, tuple[tuple[str, float], ...]]
+"""What it is, and of which sweeps: one of the same name that was created at another time is another one."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +57,11 @@ class Derived:
 
     def __init__(self, storage: Storage, statuses: Statuses, clock: Callable[[], float] = time.monotonic) -> None:
         self._storage, self._statuses, self._clock = storage, statuses, clock
-        self._made: dict[tuple[str, tuple[tuple[str, float], ...]], _Made] = {}
-        # One at a time: two at once would take as long, and twice the memory.
+        self._made: dict[_Key, _Made] = {}
+        # Held for as long as it takes to look; what is kept has to wait for nothing that is being made.
         self._lock = threading.Lock()
+        # One at a time: two at once would take as long, and twice the memory.
+        self._making = threading.Lock()
 
     def importance(self, name: str) -> WhatMattered:
         """Say which hyperparameters a sweep's scores depend on, as of a while ago if it runs.
@@ -159,36 +166,61 @@ class Derived:
         return self._get_of((name,), what, lambda sweeps: make(*sweeps))
 
     def _get_of(self, names: Sequence[str], what: str, make: Callable[[Sequence[Sweep]], Any]) -> Any:
-        for name in names:
-            self._statuses.see(name)
+        _, _, known = self._look(names, what)
+        if known is None:
+            with held(self._making):
+                # Looked at again, as one may have waited here for long.
+                seen, key, known = self._look(names, what)
+                if known is None:
+                    known = self._make(names, seen, key, make)
+        return known.value
+
+    def _look(self, names: Sequence[str], what: str) -> tuple[Sequence[Seen], _Key, _Made | None]:
+        """Return what sweeps are like, how it is kept, and what is kept if it may still be told."""
+        seen, now = [self._statuses.see(name) for name in names], self._clock()
+        key = (what, tuple((one.name, one.status.sweep.created_at) for one in seen))
         with self._lock:
-            # Looked at again, as one may have waited here for long.
-            seen, now = [self._statuses.see(name) for name in names], self._clock()
-            # A sweep of that name that was deleted is another one.
-            key = (what, tuple((one.name, one.status.sweep.created_at) for one in seen))
-            known = self._made.pop(key, None)
-            if known is not None:
-                is_of_now = all(
-                    trials() is one.trials and status() is one.status
-                    for one, (trials, status) in zip(seen, known.of, strict=True)
-                )
-                runs = any(not one.is_over for one in seen)
-                if is_of_now or (runs and now - known.at < known.took_s / _SHARE):
-                    self._made[key] = known
-                    return known.value
-            value = make([self._storage.sweep(name) for name in names])
-            took_s = self._clock() - now
-            of = tuple((ref(one.trials), ref(one.status)) for one in seen)
-            self._made[key] = _Made(of, value, _num_bytes(value), now, took_s)
-            while len(self._made) > _MOST_KEPT or (len(self._made) > 1 and self.num_bytes > _MOST_BYTES):
+            known = self._made.get(key)
+            if known is None or not _may_be_told(known, seen, now):
+                return seen, key, None
+            # The last is the one that somebody has asked for.
+            self._made[key] = self._made.pop(key)
+            return seen, key, known
+
+    def _make(
+        self, names: Sequence[str], seen: Sequence[Seen], key: _Key, make: Callable[[Sequence[Sweep]], Any]
+    ) -> _Made:
+        with self._lock:
+            # Nobody needs the memory of what it was before.
+            self._made.pop(key, None)
+        now = self._clock()
+        value = make([self._storage.sweep(name) for name in names])
+        took_s = self._clock() - now
+        of = tuple((ref(one.trials), ref(one.status)) for one in seen)
+        made = _Made(of, value, _num_bytes(value), now, took_s)
+        with self._lock:
+            self._made[key] = made
+            while len(self._made) > _MOST_KEPT or (len(self._made) > 1 and self._num_bytes() > _MOST_BYTES):
                 # The first is the one that nobody has asked for the longest.
                 del self._made[next(iter(self._made))]
-            return value
+        return made
 
     @property
     def num_bytes(self) -> int:
         """About how many bytes are kept."""
+        with self._lock:
+            return self._num_bytes()
+
+    def _num_bytes(self) -> int:
         return sum(made.num_bytes for made in self._made.values())
+
+
+def _may_be_told(made: _Made, seen: Sequence[Seen], now: float) -> bool:
+    is_of_now = all(
+        trials() is one.trials and status() is one.status for one, (trials, status) in zip(seen, made.of, strict=True)
+    )
+    runs = any(not one.is_over for one in seen)
+    return is_of_now or (runs and now - made.at < made.took_s / _SHARE)
 
 
 def _num_bytes(value: Any) -> int:

@@ -19,7 +19,7 @@ from policies.envs.tallies import Reached
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.service.folder_names import check_text
 from tune_jobs.service.storage_health import is_of_store
-from tune_jobs.store.candidates import leave_out
+from tune_jobs.store.candidates import leave_out, some_trials
 from tune_jobs.store.contract import Storage, Sweep
 from tune_jobs.store.objects.at_once import AT_ONCE
 from tune_jobs.store.patience import impatient
@@ -254,20 +254,16 @@ def _told(written: Trials, reached: Mapping[str, Reached], *, killed: bool) -> T
 
 def _read(sweep: Sweep, stamps: Mapping[str, tuple[int, ...]], known: Trials | None) -> Trials:
     """Read the records that were written since, and take the others as they were."""
-    before = {} if known is None else {record.trial_id: record for record in known.records}
-    records, scores = [], {}
-    for trial_id, stamp in stamps.items():
-        if known is not None and known.stamps.get(trial_id) == stamp:
-            if trial_id not in before:
-                continue  # it was damaged, and still is
-            record, scores[trial_id] = before[trial_id], known.scores[trial_id]
-        else:
-            try:
-                record = sweep.trial(trial_id).read_record()
-            except CheckpointError as error:
-                leave_out(error)
-                continue
-            scored = score_trial(record)
-            scores[trial_id] = None if scored is None else scored.score
+    before = Trials((), {}, {}) if known is None else known
+    same = {trial_id for trial_id, stamp in stamps.items() if before.stamps.get(trial_id) == stamp}
+    # One that was damaged, and still is, is in neither.
+    records = [record for record in before.records if record.trial_id in same]
+    scores = {record.trial_id: before.scores[record.trial_id] for record in records}
+    for trial_id, record in some_trials(sweep, [name for name in stamps if name not in same]).items():
+        if isinstance(record, CheckpointError):
+            leave_out(record)
+            continue
         records.append(record)
+        scored = score_trial(record)
+        scores[trial_id] = None if scored is None else scored.score
     return Trials(tuple(sorted(records, key=lambda record: record.index)), scores, stamps)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 
 from policies.errors import CannotRunError, CheckpointError, NotFoundError
+from tune_jobs.service.busy import BusyError, held
 from tune_jobs.service.ending import tell_left
 from tune_jobs.service.event_log import EventLog
 from tune_jobs.service.labels import Labels
@@ -61,9 +62,12 @@ class Follower:
 
         Raises:
             NotFoundError: There is nothing to be followed.
+            BusyError: Somebody else looks, and is not to be waited for.
         """
         self.used_at = time.monotonic()
-        with self._looking:
+        if self._thread is not None:
+            return
+        with held(self._looking):
             if self._thread is None:
                 with impatient():
                     self.log.add(self._view.changes())
@@ -91,8 +95,12 @@ class Follower:
         return self.log.num_listeners > 0
 
     def curves(self, most: int) -> tuple[str, dict[str, Columns]]:
-        """Return the id of the last event and, of a sweep, the curves as of then: at most so many points a trial."""
-        with self._looking:
+        """Return the id of the last event and, of a sweep, the curves as of then: at most so many points a trial.
+
+        Raises:
+            BusyError: Somebody else looks, and is not to be waited for.
+        """
+        with held(self._looking):
             curves = self._view.curves.columns(most) if isinstance(self._view, SweepView) else {}
             self._awaited_until = time.monotonic() + AWAITED_S
             return self.log.last_id, curves
@@ -201,6 +209,9 @@ class Watching:
                     watch.end()
         try:
             watch.begin()
+        except BusyError:
+            # Somebody looks, and what they follow is followed.
+            raise
         except BaseException:
             with self._lock:
                 if self._watches.get(name) is watch:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from analysis.compact import CompactIterations
 from analysis.numbering import place_of
@@ -18,8 +18,10 @@ from analysis.wording import counted
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS, SWEEP_RECORD
+from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.presence import is_there
 from tune_jobs.store.results_file import Scored
+from tune_jobs.store.urls import is_url
 
 _LOG = logging.getLogger(__name__)
 
@@ -40,6 +42,23 @@ def readable_trials(store: Sweep) -> list[TrialRecord]:
             except CheckpointError as error:
                 leave_out(error)
     return sorted(records, key=lambda record: record.index)
+
+
+def some_trials(store: Sweep, trial_ids: Collection[str]) -> dict[str, TrialRecord | CheckpointError]:
+    """Read the records of some trials, by id, those of an object store side by side; of a damaged one its error.
+
+    Raises:
+        NotFoundError: One of them has no record.
+    """
+
+    def read(trial_id: str) -> TrialRecord | CheckpointError:
+        try:
+            return store.trial(trial_id).read_record()
+        except CheckpointError as error:
+            return error
+
+    found = side_by_side(read, trial_ids) if is_url(store.place) else map(read, trial_ids)
+    return dict(zip(trial_ids, found, strict=True))
 
 
 def read_trials(store: Sweep) -> list[TrialRecord]:

@@ -14,7 +14,7 @@ from policies.envs.faults import Frame, frame_of_env
 from policies.files import open_regular
 
 _TAIL_BYTES = 200_000
-_CONTINUED = re.compile(r"process \d+: built from checkpoint (\d+)$")
+_CONTINUED = re.compile(rb"process \d+: built from checkpoint (\d+)$")
 _TIMEOUT_MARK = "Timeout ("
 _FRAME = re.compile(r'  File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>.*)')
 # Files with the loops of a trial's own thread, and files from which this package calls an environment's code.
@@ -56,10 +56,10 @@ def continued_from(path: Path) -> int | None:
     """
     try:
         with open_regular(path) as file:
-            lines = file.read().decode("utf-8", errors="replace").splitlines()
+            # One line after the other: a log may be larger than the memory.
+            return min((int(found[1]) for line in file if (found := _CONTINUED.search(line))), default=None)
     except OSError:
         return None
-    return min((int(found[1]) for line in lines if (found := _CONTINUED.search(line))), default=None)
 
 
 def log_tail(path: Path, what: str = "", num_lines: int = 15) -> str:

@@ -27,6 +27,8 @@ from policies.files import read_regular
 
 _BEGINNING = re.compile(rb'\{"iteration":\s*(\d{1,18}),')
 """Matches the iteration in a line as it is written; other lines are parsed to find their iteration."""
+_PASSED = re.compile(_BEGINNING.pattern + rb'\s*"num_env_steps":\s*(\d{1,18}),')
+"""Matches what of a line shows whether others agree with it."""
 _SHOWN_BYTES = 60
 MAX_BYTES = 2**30
 """The most bytes that are read, enough for a million iterations."""
@@ -59,8 +61,20 @@ class ResultsFile:
     """The bytes after the last newline: part of a line that is being written, or was when its process was killed."""
 
 
-def read_results(path: Path) -> ResultsFile:
+@dataclass(frozen=True)
+class _Passed:
+    """A line that was not asked for; the lines after it have to agree with it."""
+
+    iteration: int
+    num_env_steps: int
+
+
+def read_results(path: Path, after: int = -1) -> ResultsFile:
     """Read the lines that can be read; the result is empty if there is no file.
+
+    Args:
+        path: The file.
+        after: Only lines of later iterations are read; of the others, only the beginning is looked at.
 
     Raises:
         CheckpointError: The file exists but cannot be read at all.
@@ -75,16 +89,25 @@ def read_results(path: Path) -> ResultsFile:
             "Move it away; the trial continues from its latest checkpoint, without this part of its curve.",
         ) from error
     bad: list[BadLine] = []
-    read: list[tuple[int, bytes, IterationRecord]] = []
+    read: list[tuple[int, bytes, IterationRecord | _Passed]] = []
     for number, line in enumerate(lines, start=1):
         try:
-            read.append((number, line, IterationRecord.model_validate_json(line)))
+            read.append((number, line, _passed(line, after) or IterationRecord.model_validate_json(line)))
         except ValidationError:
             bad.append(BadLine(number, line, "is no result"))
     records = [record for _, _, record in read]
     kept = _agreeing(records)
     bad += _contradictions(read, {read[index][0] for index in kept})
-    return ResultsFile([records[index] for index in kept], sorted(bad, key=lambda line: line.number), tail)
+    wanted = [
+        record for index in kept if isinstance(record := records[index], IterationRecord) and record.iteration > after
+    ]
+    return ResultsFile(wanted, sorted(bad, key=lambda line: line.number), tail)
+
+
+def _passed(line: bytes, after: int) -> _Passed | None:
+    """Return the numbers of a line that was not asked for; None: it has to be parsed."""
+    found = None if after < 0 else _PASSED.match(line)
+    return None if found is None or int(found[1]) > after else _Passed(int(found[1]), int(found[2]))
 
 
 class _Result(Protocol):
@@ -134,10 +157,10 @@ def read_scores(path: Path, wanted: Collection[int]) -> dict[int, list[Scored]]:
     return found
 
 
-def _contradictions(read: Sequence[tuple[int, bytes, IterationRecord]], kept: set[int]) -> list[BadLine]:
+def _contradictions(read: Sequence[tuple[int, bytes, _Result]], kept: set[int]) -> list[BadLine]:
     """Return the lines that can be read but are not kept, each with what it contradicts."""
     found = []
-    last: IterationRecord | None = None
+    last: _Result | None = None
     for number, line, record in read:
         if number in kept:
             last = record

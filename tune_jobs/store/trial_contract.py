@@ -129,16 +129,22 @@ class Trial(Protocol):
         """
         ...
 
-    def read_results(self) -> ResultsFile:
+    def read_results(self, after: int = -1) -> ResultsFile:
         """Read the results: the lines that can be read, and those that can't; empty if there are none.
+
+        Args:
+            after: Only results of later iterations are read; damage in the others may not be noticed.
 
         Raises:
             CheckpointError: The results exist but cannot be read at all.
         """
         ...
 
-    def read_iterations(self) -> list[IterationRecord]:
+    def read_iterations(self, after: int = -1) -> list[IterationRecord]:
         """Read the results that can be read, with rising iterations; a warning names what is left out.
+
+        Args:
+            after: As for `read_results`.
 
         Raises:
             CheckpointError: In the same cases as `read_results`.

@@ -120,13 +120,13 @@ class TrialStore(OwnedFolder):
         with self.owned(), open_to_append(self.results_path) as file:
             file.write(text.encode())
 
-    def read_results(self) -> ResultsFile:
+    def read_results(self, after: int = -1) -> ResultsFile:
         """Read results.jsonl; see `Trial.read_results`."""
-        return read_results(self.results_path)
+        return read_results(self.results_path, after)
 
-    def read_iterations(self) -> list[IterationRecord]:
+    def read_iterations(self, after: int = -1) -> list[IterationRecord]:
         """Read the lines of results.jsonl that can be read, with a warning for others; empty without a file."""
-        found = self.read_results()
+        found = self.read_results(after)
         for bad in found.bad:
             _LOG.warning("%s is read without a line that is damaged: %s", self.results_path, bad)
         return found.records

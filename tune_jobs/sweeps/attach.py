@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from analysis.records import SweepRecord, TrialRecord
@@ -13,7 +13,7 @@ from policies.errors import CannotRunError, CheckpointError
 from tune_jobs.process.interruption import EXIT_CODE as INTERRUPTED
 from tune_jobs.ray_tune.jobs import Job
 from tune_jobs.spec.file import stored_spec
-from tune_jobs.store.candidates import readable_trials
+from tune_jobs.store.candidates import readable_trials, some_trials
 from tune_jobs.store.command_names import name_in_commands
 from tune_jobs.store.contract import Sweep
 from tune_jobs.store.opening import resume_command
@@ -147,8 +147,10 @@ class _Look:
             trials = readable_trials(self._store)
             self.monitor.begin_stage("", trials, _caps(record, trials))
         else:
-            for trial in _read(self._store, changed):
-                self.monitor.update(trial)
+            for trial in some_trials(self._store, changed).values():
+                # Of one that is damaged it is told in the end, and by `status`.
+                if isinstance(trial, TrialRecord):
+                    self.monitor.update(trial)
         self.monitor.phase = self._phase(record)
 
     def _phase(self, record: SweepRecord) -> str:
@@ -185,17 +187,6 @@ def _caps(record: SweepRecord, trials: list[TrialRecord]) -> Mapping[str, int]:
     except CheckpointError:
         # A sweep of another version is shown, too, without what is left of it.
         return {trial.trial_id: trial.num_env_steps for trial in trials}
-
-
-def _read(store: Sweep, trial_ids: Iterable[str]) -> list[TrialRecord]:
-    found = []
-    for trial_id in trial_ids:
-        try:
-            found.append(store.trial(trial_id).read_record())
-        except CheckpointError:
-            # It is told in the end, and by `status`.
-            continue
-    return found
 
 
 def _result(store: Sweep, record: SweepRecord, job: Job | None) -> SweepResult:

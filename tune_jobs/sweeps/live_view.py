@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import IO
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.live import Live
 from rich.spinner import Spinner
 from rich.text import Text
@@ -27,6 +27,9 @@ _REFRESH_PER_S = 4
 _LINE_INTERVAL_S = 10.0
 _LOOK_S = 0.5
 """How soon a line tells what somebody waits for."""
+_KEPT_TIMES = 10
+"""A table is shown so many times as long as it took to draw: the sweep is driven in the same process."""
+_MOST_KEPT_S = 3.0
 
 Say = Callable[[str], None]
 """Takes what is done now, such as "writing the report"."""
@@ -81,13 +84,26 @@ class _Lines:
 
 
 class _Screen:
-    """Gives rich the present table each time it redraws."""
+    """Gives rich the present table each time it redraws: of thousands of trials, one that is a moment old."""
 
     def __init__(self, monitor: SweepMonitor) -> None:
         self._monitor = monitor
+        self._table: RenderableType = ""
+        self._drawn_for: tuple[object, ...] = ()
+        self._kept_until = 0.0
+
+    def table(self, width: int, height: int | None = None) -> RenderableType:
+        """Return the table: a new one at the end, when it stops and in another size, else as often as it is cheap."""
+        asked_for = (width, height, self._monitor.stopping)
+        began = time.monotonic()
+        if self._monitor.is_over or asked_for != self._drawn_for or began >= self._kept_until:
+            self._table, self._drawn_for = render(self._monitor, width, height), asked_for
+            now = time.monotonic()
+            self._kept_until = now + min(_KEPT_TIMES * (now - began), _MOST_KEPT_S)
+        return self._table
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield render(self._monitor, options.max_width, console.height)
+        yield self.table(options.max_width, console.height)
 
 
 class _Drawing(Live):
@@ -124,15 +140,15 @@ def shown(monitor: SweepMonitor, progress: str, log: Path, notes: Sequence[str] 
 
 
 def _view(monitor: SweepMonitor, stream: IO[str]) -> AbstractContextManager[object]:
+    screen = _Screen(monitor)
     if kernel_shell() is not None:
-        return NotebookView(monitor.name, lambda: render(monitor, WIDTH), is_line=False)
+        return NotebookView(monitor.name, lambda: screen.table(WIDTH), is_line=False)
     console = FittingConsole(file=stream)
     if _can_redraw(stream, console):
         # Rich would take what is printed meanwhile to the terminal, and it is for the log.
         return _Drawing(
-            _Screen(monitor), console=console, refresh_per_second=_REFRESH_PER_S, redirect_stdout=False,
-            redirect_stderr=False,
-        )  # fmt: skip
+            screen, console=console, refresh_per_second=_REFRESH_PER_S, redirect_stdout=False, redirect_stderr=False
+        )
     return _Lines(lambda: summary_line(monitor), stream, at_the_end=True, has_news=lambda: monitor.stopping)
 
 

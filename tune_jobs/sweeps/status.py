@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextvars
 import shlex
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +21,10 @@ from policies.arguments import checked
 from policies.errors import CheckpointError, TuneJobsError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
+from tune_jobs.store.objects.at_once import AT_ONCE
 from tune_jobs.store.opening import open_storage, open_sweep, resume_command
 from tune_jobs.store.transitions import paused
+from tune_jobs.store.urls import is_url
 from tune_jobs.sweeps.forecast import Forecast, caps_of, forecast
 from tune_jobs.sweeps.storage import storage_place
 
@@ -214,12 +218,30 @@ def list_sweeps(storage: str | Path | None = None) -> list[SweepStatus]:
     from tune_jobs.store.candidates import leave_out
 
     found = Sweeps()
-    for store in open_storage(storage_place(storage)).sweeps():
-        try:
-            found.append(_status(store))
-        except TuneJobsError as error:
-            leave_out(error)
+    for seen in _each(open_storage(storage_place(storage)).sweeps()):
+        if isinstance(seen, TuneJobsError):
+            leave_out(seen)
+        else:
+            found.append(seen)
     return found
+
+
+def _each(stores: Sequence[Sweep]) -> Iterable[SweepStatus | TuneJobsError]:
+    """Look at several sweeps; at those of an object store side by side, as each look waits for answers."""
+    if not any(is_url(store.place) for store in stores):
+        return map(_readable, stores)
+    contexts = [contextvars.copy_context() for _ in stores]
+    # Not those for single requests, for which each of these waits.
+    with ThreadPoolExecutor(AT_ONCE, "list") as pool:
+        return list(pool.map(lambda context, store: context.run(_readable, store), contexts, stores))
+
+
+def _readable(store: Sweep) -> SweepStatus | TuneJobsError:
+    """Return the status of a sweep, or why it can't be read."""
+    try:
+        return _status(store)
+    except TuneJobsError as error:
+        return error
 
 
 def _status(store: Sweep) -> SweepStatus:

@@ -7,12 +7,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 
 from tune_jobs.service.http.caller import TheService
+from tune_jobs.service.http.waiting import waits_aside
 from tune_jobs.sweeps.plain import to_json
 
 router = APIRouter(prefix="/api/v1", tags=["comparisons"])
 
 
 @router.get("/comparisons")
+@waits_aside
 def comparisons(
     service: TheService,
     sweeps: Annotated[str, Query(max_length=2_000, description="From 2 to 6 sweeps, separated by commas.")],

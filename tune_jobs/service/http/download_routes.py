@@ -16,6 +16,7 @@ from tune_jobs.service.http.best_policy import has_best, no_best
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.downloads import NO_SCRIPTS, SANDBOX, Archive, Download, attachment
 from tune_jobs.service.http.models import FileOfSweep
+from tune_jobs.service.http.waiting import waits_aside
 from tune_jobs.service.service import Service
 from tune_jobs.store.contract import Sweep
 from tune_jobs.sweeps.outcome import Film
@@ -125,6 +126,7 @@ def checkpoint(name: str, trial_id: str, iteration: Iteration, service: TheServi
 
 
 @router.get("/trials.csv", responses={200: {"content": {"text/csv": {}}}}, response_class=Response)
+@waits_aside
 def trials_csv(name: str, service: TheService) -> Response:
     """Download the table of trials, as `tune-jobs export` writes it; of a running sweep as of a while ago."""
     headers = {"Content-Disposition": attachment(f"{name}-trials.csv")}
@@ -132,6 +134,7 @@ def trials_csv(name: str, service: TheService) -> Response:
 
 
 @router.get("/file", responses={200: {"content": {"application/gzip": {}}}}, response_class=Response)
+@waits_aside
 def sweep_file(name: str, service: TheService) -> Response:
     """Download the sweep as one file, which the page of any service shows; of a running sweep as of a while ago."""
     headers = {"Content-Disposition": attachment(f"{name}.tunejobs")}
@@ -150,6 +153,7 @@ def best(name: str, service: TheService) -> dict[str, Any]:
 
 
 @router.get("/importance")
+@waits_aside
 def importance(name: str, service: TheService) -> dict[str, Any]:
     """Say which hyperparameters scores depend on, as `tune-jobs importance --json`; of a running sweep a while ago."""
     found: dict[str, Any] = to_json(service.derived.importance(name))
@@ -157,6 +161,7 @@ def importance(name: str, service: TheService) -> dict[str, Any]:
 
 
 @router.get("/front")
+@waits_aside
 def front(name: str, service: TheService) -> FrontView:
     """Set scores against env steps: the Pareto front of a sweep that asks for it; of a running one a while ago."""
     return service.derived.front(name)

@@ -10,6 +10,7 @@ from pydantic_core import to_json
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.event_stream import EventStream
 from tune_jobs.service.http.models import CurvesOfSweep
+from tune_jobs.service.http.waiting import waits_aside
 from tune_jobs.service.problem_documents import problems
 
 router = APIRouter(prefix="/api/v1", tags=["events"])
@@ -27,6 +28,7 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 
 
 @router.get("/sweeps/{name}/curves", responses={200: {"model": CurvesOfSweep}})
+@waits_aside
 def curves(
     name: str,
     service: TheService,
@@ -45,6 +47,7 @@ def curves(
 
 
 @router.get("/sweeps/{name}/events", status_code=200, responses=_STREAM, response_class=EventStream)
+@waits_aside
 def sweep_events(
     name: str, service: TheService, last_event_id: LastId = None, last_id: LastIdAgain = None
 ) -> EventStream:
@@ -58,6 +61,7 @@ def sweep_events(
 
 
 @router.get("/events", status_code=200, responses=_STREAM, response_class=EventStream)
+@waits_aside
 def list_events(service: TheService, last_event_id: LastId = None, last_id: LastIdAgain = None) -> EventStream:
     """Tell what changes in the list of sweeps, as server-sent events.
 

@@ -14,6 +14,7 @@ from pydantic_core import to_json
 from analysis.records import Objective
 from tune_jobs.service.http.caller import TheService
 from tune_jobs.service.http.pages import MAX_CURSOR, page_of
+from tune_jobs.service.http.waiting import waits_aside
 from tune_jobs.service.jobs import Job
 from tune_jobs.service.problem_documents import problems
 from tune_jobs.sweeps.status import SweepStatus
@@ -55,12 +56,14 @@ def statuses(
 
 
 @router.get("/sweeps/{name}/records", responses=_json("array", "The records, by index."), response_class=Response)
+@waits_aside
 def records(name: str, service: TheService) -> Response:
     """Return the records of all trials with the checkpoints that may be chosen; of a running sweep as a while ago."""
     return Response(service.derived.records(name), media_type="application/json")
 
 
 @router.get("/sweeps/{name}/what-mattered", responses=_json("object", "What mattered."), response_class=Response)
+@waits_aside
 def what_mattered(name: str, service: TheService) -> Response:
     """Say which hyperparameters scores depend on, as `importance` does, with the numbers that JSON lacks as texts."""
     return _answer(service.derived.importance(name))
@@ -71,6 +74,7 @@ def what_mattered(name: str, service: TheService) -> Response:
     responses={**_json("object", "The comparison."), **problems({404: "There is no such sweep or trial."})},
     response_class=Response,
 )
+@waits_aside
 def comparison(
     service: TheService,
     *,

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
 
-from analysis.records import TrialRecord
+from analysis.records import IterationRecord, TrialRecord
 from policies.errors import CheckpointError, NotFoundError
 from tune_jobs.service.access.callers import Caller
 from tune_jobs.service.http.caller import (
@@ -42,6 +42,8 @@ router = APIRouter(prefix="/api/v1", tags=["sweeps"])
 Limit = Annotated[int, Query(ge=1, le=1_000, description="The most items of a page.")]
 Cursor = Annotated[str | None, Query(max_length=MAX_CURSOR, description="`next_cursor` of the page before.")]
 Order = Annotated[Literal["asc", "desc"], Query(description="The order of the sort.")]
+
+_EPISODES = frozenset({"episode_returns", "episode_lengths"})
 
 
 @router.post(
@@ -324,15 +326,12 @@ def iterations(
 ) -> list[dict[str, Any]]:
     """Return what each iteration of a trial showed, without its single episodes."""
     trial(name, trial_id, service)
-    found = service.storage.sweep(name).trial(trial_id).read_iterations()
-    return [iteration_row(item) for item in found if item.iteration > after]
+    return [iteration_row(item) for item in service.storage.sweep(name).trial(trial_id).read_iterations(after)]
 
 
-def iteration_row(item: Any) -> dict[str, Any]:
+def iteration_row(item: IterationRecord) -> dict[str, Any]:
     """Return an iteration without its single episodes, which are many."""
-    row: dict[str, Any] = to_json(item)
-    for name in ("episode_returns", "episode_lengths", "mean_return", "std_return"):
-        row.pop(name, None)
+    row: dict[str, Any] = to_json({field: value for field, value in item if field not in _EPISODES})
     return row
 
 

@@ -133,14 +133,14 @@ class ObjectTrial:
         with self._state.replacing_results():
             self._state.local().keep_iterations(records)
 
-    def read_results(self) -> ResultsFile:
+    def read_results(self, after: int = -1) -> ResultsFile:
         """Read the results."""
         with self._parts.named():
-            return self._state.local().read_results()
+            return self._state.local().read_results(after)
 
-    def read_iterations(self) -> list[IterationRecord]:
+    def read_iterations(self, after: int = -1) -> list[IterationRecord]:
         """Read the results that can be read, with rising iterations; a warning names what is left out."""
-        found = self.read_results()
+        found = self.read_results(after)
         for bad in found.bad:
             name = self._parts.bucket.name_of(f"{names.TRIALS_FOLDER}/{self.trial_id}")
             _LOG.warning("The results in %s are read without a line that is damaged: %s", name, bad)
