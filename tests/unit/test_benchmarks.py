@@ -69,6 +69,8 @@ NAMED = {
         "is updated once in a phase of training where ours is four times",
     "SB3's actions are all random until learning_starts, ours as epsilon says.":
         "its actions are all random until learning starts",
+    "SB3 standardises advantages over each minibatch, ours over the whole train batch.":
+        "it standardises advantages over each minibatch",
     "entropy_coeff stays at its first value: SB3 has no schedule for ent_coef.":
         "it has no schedule of the entropy's weight",
 }  # fmt: skip

@@ -31,7 +31,7 @@ ray.init, ray.is_initialized, cluster.check_is_ray = init, lambda: False, lambda
 before = environments()
 for address in (None, "host:6379", "ray://host:10001"):
     try:
-        with cluster.connect(address, packs=False):
+        with cluster.connect(address, forked=None):
             pass
     except CannotRunError as error:
         assert "far enough" in str(error), error
