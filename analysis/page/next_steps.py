@@ -54,7 +54,7 @@ def _commands(source: Source) -> Iterator[Step]:
     path, settings = shlex.quote(source.path), source.settings
     if source.sweep.state in ("created", "interrupted"):
         yield Step("Go on", "The sweep is not finished.", f"tune-jobs resume {path}")
-    elif any(trial.status == "failed" for trial in source.trials):
+    elif source.sweep.state == "completed" and any(trial.status == "failed" for trial in source.trials):
         why = "Trials that failed count as the worst. Once the cause is mended, this runs them again."
         yield Step("Retry", why, f"tune-jobs resume {path} --retry-failed")
     if not source.is_trained or not source.trials:

@@ -161,6 +161,9 @@ def test_next_steps_run_failed_trials_again_unless_the_sweep_goes_on_first() -> 
     steps = steps_of(synthetic)
     assert steps["Go on"].text == "tune-jobs resume sweep"
     assert "Retry" not in steps
+    # One that runs refuses it.
+    synthetic.sweep = synthetic.sweep.model_copy(update={"state": "running"})
+    assert "Retry" not in steps_of(synthetic)
 
 
 def test_next_steps_keep_all_arguments_of_the_environment() -> None:

@@ -1,7 +1,7 @@
-"""A process that has imported what packs need, from which the processes of a local Ray are forked (decision 37).
+"""A process that has imported what trials need, from which the processes of a local Ray are forked (decision 37).
 
-Ray 2.60 starts a process for each actor, and one that trains a pack would import modules for three seconds before its
-first env step. A fork takes some hundredths of a second, and shares the memory of those modules.
+Ray 2.60 starts a process for each actor, and one that trains would import modules for three seconds before its first
+env step. A fork takes some hundredths of a second, and shares the memory of those modules.
 
 It is run by its path. It has one thread of Python, joins no Ray and asks no GPU: neither would survive a fork.
 `forked_worker` asks it, in the place of Ray's own command.

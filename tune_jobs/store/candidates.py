@@ -18,7 +18,6 @@ from analysis.wording import counted
 from policies.errors import CheckpointError, NotFoundError, TuneJobsError
 from tune_jobs.store.contract import Sweep, Trial
 from tune_jobs.store.names import RESULTS, SWEEP_RECORD
-from tune_jobs.store.objects.at_once import side_by_side
 from tune_jobs.store.presence import is_there
 from tune_jobs.store.results_file import Scored
 from tune_jobs.store.urls import is_url
@@ -57,8 +56,11 @@ def some_trials(store: Sweep, trial_ids: Collection[str]) -> dict[str, TrialReco
         except CheckpointError as error:
             return error
 
-    found = side_by_side(read, trial_ids) if is_url(store.place) else map(read, trial_ids)
-    return dict(zip(trial_ids, found, strict=True))
+    if not is_url(store.place):
+        return {trial_id: read(trial_id) for trial_id in trial_ids}
+    from tune_jobs.store.objects.at_once import side_by_side
+
+    return dict(zip(trial_ids, side_by_side(read, trial_ids), strict=True))
 
 
 def read_trials(store: Sweep) -> list[TrialRecord]:

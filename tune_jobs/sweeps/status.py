@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextvars
 import shlex
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ from policies.arguments import checked
 from policies.errors import CheckpointError, TuneJobsError
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.store.contract import Sweep
-from tune_jobs.store.objects.at_once import AT_ONCE
 from tune_jobs.store.opening import open_storage, open_sweep, resume_command
 from tune_jobs.store.transitions import paused
 from tune_jobs.store.urls import is_url
@@ -230,6 +227,12 @@ def _each(stores: Sequence[Sweep]) -> Iterable[SweepStatus | TuneJobsError]:
     """Look at several sweeps; at those of an object store side by side, as each look waits for answers."""
     if not any(is_url(store.place) for store in stores):
         return map(_readable, stores)
+    # Folders need none of it.
+    import contextvars
+    from concurrent.futures import ThreadPoolExecutor
+
+    from tune_jobs.store.objects.at_once import AT_ONCE
+
     contexts = [contextvars.copy_context() for _ in stores]
     # Not those for single requests, for which each of these waits.
     with ThreadPoolExecutor(AT_ONCE, "list") as pool:
