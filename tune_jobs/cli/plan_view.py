@@ -10,6 +10,7 @@ from analysis.records import TRAINING_LENGTH
 from analysis.wording import bytes_text, counted
 from tune_jobs.cli.output import make_console, make_table, print_facts, print_json, span
 from tune_jobs.cli.whole_columns import print_whole
+from tune_jobs.search.startup import most_needed
 from tune_jobs.search.subpopulations import subpopulation_of
 from tune_jobs.spec.training_length import ends_of
 
@@ -68,7 +69,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan, *, finish: bool) -> dict[str, 
         "engine": _engine_fact(plan),
         "at once": f"{_at_once(plan)}; {machine.source} has {has}",
         "a trial stops at": " or ".join(rules),
-        "search": _search_fact(spec),
+        "search": search_fact(spec),
         "scheduler": _scheduler_fact(spec),
         "then": _confirm_fact(race) if finish else "nothing (--no-finish)",
         "env steps": _env_steps_fact(plan, race),
@@ -115,11 +116,15 @@ def _resources(cpus: float, gpus: float) -> str:
     return f"{cpus:g} CPU{'s' * (cpus > 1)}" + (f" and {gpus:g} GPU{'s' * (gpus > 1)}" if gpus else "")
 
 
-def _search_fact(spec: SweepSpec) -> str:
+def search_fact(spec: SweepSpec) -> str:
+    """Return what a plan says of how points are chosen."""
     if not spec.search.has_model:
         return "random draws for each combination of the grids"
-    ended = f"{spec.search.num_startup_trials} have ended" + (", those of prior among them" if spec.prior else "")
-    return f"{spec.search.type}: its model proposes points once {ended}"
+    wanted, ended = spec.search.num_startup_trials, ", those of prior among them" if spec.prior else ""
+    if spec.scheduler.type != "none" and (most := most_needed(wanted, len(spec.points) + spec.num_samples)) > wanted:
+        ended += f", or fewer that were trained for as long as {wanted} whole ones"
+        wanted = most
+    return f"{spec.search.type}: its model proposes points once {wanted} have ended{ended}"
 
 
 def _scheduler_fact(spec: SweepSpec) -> str:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from analysis.objectives import env_steps_of
-from analysis.records import FINISHED, Objective, TrialRecord
+from analysis.records import FINISHED, Objective, TrialRecord, whole_length
 from analysis.selection import score_trial
 from tune_jobs.search.chosen_point import outside
 from tune_jobs.spec.sweep_spec import SweepSpec
@@ -45,6 +45,8 @@ class KnownPoint:
     """Whether at least one of its seeds has not ended."""
     level: int | None = None
     """The rung at which a scheduler ended it; None: none did."""
+    trained: float = 1.0
+    """The share of its training that it has had, the mean over its ended seeds: below 1 if a scheduler ended it."""
     is_own: bool = True
     """Whether it is one of this sweep; one of an earlier sweep tells a model as much, but was never tried in this."""
 
@@ -133,6 +135,7 @@ def _known(
         env_steps=tuple(env_steps_of(record, spec.stop.num_env_steps, spec.stop.num_iterations) for record in ended),
         is_running=any(record.status not in FINISHED for record in members if record.seed_index < spec.seeds_per_point),
         level=_level(spec, members),
+        trained=sum(_trained(spec, record) for record in ended) / len(ended) if ended else 1.0,
     )
 
 
@@ -149,6 +152,16 @@ def tell_scores(records: Sequence[TrialRecord]) -> bool | None:
     """Return whether trials that ended with an evaluation have scores by the objective; None: none has ended so yet."""
     ended = [record for record in records if record.status in FINISHED and score_trial(record) is not None]
     return all(record.objective_score is not None for record in ended) if ended else None
+
+
+def _trained(spec: SweepSpec, record: TrialRecord) -> float:
+    """Return the share of its whole training that a trial has had; only what a scheduler ended counts as less."""
+    if record.status != "stopped":
+        return 1.0
+    whole = whole_length(
+        record.point, record.hyperparams, num_env_steps=spec.stop.num_env_steps, num_iterations=spec.stop.num_iterations
+    )
+    return min(1.0, record.num_env_steps / whole)
 
 
 def _level(spec: SweepSpec, members: Sequence[TrialRecord]) -> int | None:

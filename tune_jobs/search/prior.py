@@ -176,7 +176,10 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
         num_failed = sum(point.score is None for point in ended)
         return [*(_like_own(item, ordered, num_failed) for item in earlier), *known]
     shares = iter(map(float, shares_of(ended)))
-    own = [point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),)) for point in known]
+    own = [
+        point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),), trained=point.trained)
+        for point in known
+    ]
     return [*(KnownPoint(item.point, (item.share,), is_own=False) for item in earlier), *own]
 
 

@@ -10,8 +10,9 @@ of the methods, needs neither Ray nor a folder:
         known.append(KnownPoint(point, scores=(train(point, seed=0), train(point, seed=1), None)))
 
 A `KnownPoint` (`tune_jobs.search.history`) is a point, the scores of its seeds (None: that one failed), whether it
-still runs (`is_running=True`: others are proposed meanwhile) and, if it was ended early, the rung that it reached. One
-that somebody else tried (`is_own=False`) tells as much, and may be proposed.
+still runs (`is_running=True`: others are proposed meanwhile) and, if it was ended early, the rung that it reached and
+the share of its training that it has had. One that somebody else tried (`is_own=False`) tells as much, and may be
+proposed.
 
 One more method is one more module with a function that is a `tune_jobs.search.asking.Method`, a row of `_METHODS`, and
 its name in `tune_jobs.spec.sections`.
@@ -35,6 +36,7 @@ from tune_jobs.search.history import History, KnownPoint
 from tune_jobs.search.one_thread import one_thread
 from tune_jobs.search.parts import Parts
 from tune_jobs.search.prior import weighed_prior, with_prior
+from tune_jobs.search.startup import is_enough
 from tune_jobs.search.two_objectives import weighed
 from tune_jobs.search.warped import rank_of
 from tune_jobs.spec.conditions import Conditions
@@ -103,9 +105,9 @@ def propose_point(
 
     Where the sweep asks for score and cost, the methods are told of both (`two_objectives`).
 
-    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, or all
-    that have are equally good, the point is the random one of its index, or another random one where its values
-    contradict each other or were tried before.
+    The same records give the same point. As long as fewer than `search.num_startup_trials` points have ended, or too
+    little of them was trained (see `next_point`), or all that have ended are equally good, the point is the random one
+    of its index, or another random one where its values contradict each other or were tried before.
 
     Args:
         spec: The sweep.
@@ -128,7 +130,7 @@ def propose_point(
         prior = [weighed_prior(each, drawn_index, spec.seed) for each in prior]
     return next_point(
         spec.search.type, spec.space, with_prior(known, prior), drawn_index, seed=spec.seed,
-        num_startup_trials=spec.search.num_startup_trials, check=check,
+        num_startup_trials=spec.search.num_startup_trials, num_points=len(spec.points) + spec.num_samples, check=check,
     )  # fmt: skip
 
 
@@ -140,6 +142,7 @@ def next_point(
     *,
     seed: int,
     num_startup_trials: int = 10,
+    num_points: int | None = None,
     check: Check = lambda _: None,
 ) -> dict[str, Any]:
     """Return the next point to try.
@@ -151,7 +154,10 @@ def next_point(
         index: The index of the point, from 0: its random numbers belong to it.
         seed: At least 0; the same seed, index and known points give the same point.
         num_startup_trials: How many points have to end before a model proposes points; until then they are random, and
-            as long as all that ended are equally good.
+            as long as all that ended are equally good. Those that a scheduler ended count for the share of their
+            training that they have had (decision 40).
+        num_points: How many points there will be in all: when a third of them have ended, a model proposes the next
+            ones however little these were trained. None: not known.
         check: Raises SpecError for a point whose values contradict each other; then another is proposed, except by
             `random`, whose points are all known and checked before.
 
@@ -163,7 +169,7 @@ def next_point(
     check_installed(method)
     if method == "random":
         return _new_draw(space, known, index, seed, lambda _: None)
-    if sum(not point.is_running for point in known) < num_startup_trials or _are_all_equal(known):
+    if not is_enough(known, num_startup_trials, num_points) or _are_all_equal(known):
         return _new_draw(space, known, index, seed, check)
     propose, parts = _METHODS[method].load(), Parts(space)
     if parts.are_the_same:

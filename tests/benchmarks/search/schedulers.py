@@ -241,7 +241,9 @@ class _Asha:
             if decision is Decision.STOP:
                 self._rule.ended(standing)
                 level = None if has_ended else int(math.log(steps / self._first_rung, self._factor) + 1e-9)
-                self._ended[name] = KnownPoint(self._points[int(name[1:])], tuple(returns[name]), level=level)
+                self._ended[name] = KnownPoint(
+                    self._points[int(name[1:])], tuple(returns[name]), level=level, trained=min(1.0, steps / self._cap)
+                )
                 self._trainer.remove(name)
                 del self._rungs[name]
                 continue
