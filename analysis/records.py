@@ -294,6 +294,9 @@ class PriorPointRecord(Record):
         description="The share of its sweep's points that it is better than; null: a seed of it failed."
     )
     env_steps: Count | None = Field(None, description="Mean env steps that a training takes; None: a former record.")
+    trained: Annotated[float, Field(ge=0, le=1)] = Field(
+        1.0, description="The share of its training that it has had; a former record tells none."
+    )
 
 
 class PriorRecord(Record):

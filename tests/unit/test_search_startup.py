@@ -10,7 +10,7 @@ from test_search_methods import SPACE, make_spec, record, valley
 from analysis.records import PriorPointRecord, PriorRecord, TrialRecord
 from tune_jobs.cli.plan_view import search_fact
 from tune_jobs.search.history import KnownPoint, known_points
-from tune_jobs.search.prior import with_prior
+from tune_jobs.search.prior import prior_record, with_prior
 from tune_jobs.search.proposal import next_point, propose_point
 from tune_jobs.search.startup import is_enough, most_needed
 from tune_jobs.spec.draws import draw_point
@@ -47,7 +47,7 @@ def test_what_was_ended_at_rungs_counts_for_what_it_trained() -> None:
     assert not is_drawn(make_spec(num_samples=300, startup=4, method="gp"), trials(spec, *[WHOLE] * 4))
 
 
-@pytest.mark.parametrize(("num_samples", "given", "needed"), [(30, 0, 10), (33, 0, 11), (31, 5, 12), (6, 0, 4)])
+@pytest.mark.parametrize(("num_samples", "given", "needed"), [(30, 0, 10), (33, 0, 11), (31, 5, 11), (6, 0, 4)])
 def test_of_a_small_sweep_a_third_has_to_end(num_samples: int, given: int, needed: int) -> None:
     points = [{"lr": 1e-3 * (1 + index), "activation": "tanh"} for index in range(given)]
     spec = make_spec(num_samples=num_samples, startup=4, method="gp", points=points, **ASHA)
@@ -63,7 +63,22 @@ def test_running_points_count_for_nothing_and_few_whole_ones_are_not_enough() ->
     assert not is_enough([KnownPoint({}, (1.0,), trained=0.1)] * 39, 4, None)
     # The sum of ten tenths is not quite one.
     assert is_enough([KnownPoint({}, (1.0,), trained=0.1)] * 10, 1, None)
-    assert (most_needed(10, 30), most_needed(10, 31), most_needed(10, 200)) == (10, 11, 67)
+    assert [most_needed(10, number, 0) for number in (30, 31, 200)] == [10, 11, 67]
+
+
+def test_of_many_that_run_at_once_the_model_proposes_some() -> None:
+    """96 points, of which 64 run at once, all of which end at the first rung."""
+    spec = make_spec(num_samples=96, startup=10, method="gp", **ASHA)
+    running = [
+        record(index, draw_point(spec.space, index, spec.seed), status="running") for index in range(96)
+    ]  # fmt: skip
+    asked = [
+        is_enough(known_points(spec, [*trials(spec, *[WHOLE // 20] * ended), *running[ended : ended + 63]]), 10, 96)
+        for ended in range(33)
+    ]
+    # With 63 beside it, a third of the 33 others have ended.
+    assert asked == [False] * 11 + [True] * 22
+    assert most_needed(10, 96, 63) == 11
 
 
 def test_without_a_sweep_the_same_counts() -> None:
@@ -91,8 +106,11 @@ def test_the_share_is_that_of_the_trial_s_own_length_and_the_mean_over_its_seeds
 
     assert shares(spec, seed(0, 10_000), seed(1, 30_000)) == [pytest.approx(0.1)]
     assert shares(spec, seed(0, 10_000), seed(1, 30_000, "running")) == [pytest.approx(0.05)]
-    # What failed, or came to an end of its own before, has told all that it will.
-    assert shares(spec, seed(0, 10_000, "failed"), seed(1, 50_000, "completed")) == [1.0]
+    # What came to an end of its own has told all that it will; ten that failed at once are no ten trainings.
+    assert shares(spec, seed(0, 50_000, "completed"), seed(1, 50_000, "completed")) == [1.0]
+    assert shares(spec, seed(0, 10_000, "failed"), seed(1, 0, "failed")) == [pytest.approx(0.025)]
+    alone = make_spec(seeds_per_point=2, method="gp")
+    assert shares(alone, seed(0, 10_000, "failed"), seed(1, 0, "failed")) == [1.0]
     assert shares(spec, seed(0, 10_000, "running"), seed(1, 0, "pending")) == [1.0]
     # A last iteration may be longer than what was left.
     assert shares(spec, seed(0, 200_500), seed(1, 200_500)) == [1.0]
@@ -104,32 +122,39 @@ def test_the_share_is_that_of_the_trial_s_own_length_and_the_mean_over_its_seeds
     assert found == [pytest.approx(0.25)]
 
 
-def test_points_of_an_earlier_sweep_are_whole_and_leave_the_own_ones_as_they_are() -> None:
-    prior = PriorRecord(
-        sweep="earlier", env_id="CartPole-v1", points=(PriorPointRecord(point={"lr": 1e-3}, share=0.5),) * 3
-    )
+def test_points_of_an_earlier_sweep_count_for_what_they_were_trained_there() -> None:
+    former = PriorPointRecord(point={"lr": 1e-3}, share=0.5)
+    points = (former, former.model_copy(update={"trained": 0.2}), PriorPointRecord(point={}, share=None, trained=0.1))
+    prior = PriorRecord(sweep="earlier", env_id="CartPole-v1", points=points)
     own = [KnownPoint({"lr": 1e-2}, (float(score),), level=0, trained=0.05) for score in range(5)]
-    assert [point.trained for point in with_prior(own, [prior])] == [1.0] * 3 + [0.05] * 5
+    assert [point.trained for point in with_prior(own, [prior])] == [1.0, 0.2, 0.1] + [0.05] * 5
     enough = [KnownPoint({"lr": 1e-2}, (float(score),)) for score in range(12)]
-    assert [point.trained for point in with_prior([*own, *enough], [prior])] == [1.0] * 3 + [0.05] * 5 + [1.0] * 12
+    found = with_prior([*own, *enough], [prior])
+    assert [point.trained for point in found] == [1.0, 0.2, 0.1] + [0.05] * 5 + [1.0] * 12
+    spec = make_spec(num_samples=300, method="gp", **ASHA)
+    earlier = prior_record(spec, "earlier", spec, trials(spec, *[WHOLE // 20] * 12, WHOLE))
+    assert [point.trained for point in earlier.points] == [pytest.approx(0.05)] * 12 + [1.0]
 
 
 FEWER = "or fewer that were trained for as long as 10 whole ones"
 
 
-def fact(**changes: Any) -> str:
-    return search_fact(make_spec(startup=10, method="gp", **changes))
+def fact(at_once: int, **changes: Any) -> str:
+    return search_fact(make_spec(startup=10, method="gp", **changes), at_once)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "at_once", "told"),
     [
-        ({"num_samples": 200}, "10 have ended"),
-        ({"num_samples": 30, **ASHA}, "10 have ended"),
-        ({"num_samples": 200, **ASHA}, f"67 have ended, {FEWER}"),
-        ({"num_samples": 31, "scheduler": "median"}, f"11 have ended, {FEWER}"),
-        ({"num_samples": 200, "prior": ["earlier"], **ASHA}, f"67 have ended, those of prior among them, {FEWER}"),
+        ({"num_samples": 200}, 1, "10 have ended"),
+        ({"num_samples": 30, **ASHA}, 1, "10 have ended"),
+        ({"num_samples": 200, **ASHA}, 1, f"67 have ended, {FEWER}"),
+        ({"num_samples": 200, **ASHA}, 21, f"60 have ended, {FEWER}"),
+        # Of two seeds each, 11 points run at once.
+        ({"num_samples": 200, "seeds_per_point": 2, **ASHA}, 21, f"64 have ended, {FEWER}"),
+        ({"num_samples": 31, "scheduler": "median"}, 1, f"11 have ended, {FEWER}"),
+        ({"num_samples": 200, "prior": ["earlier"], **ASHA}, 1, f"67 have ended, those of prior among them, {FEWER}"),
     ],
 )
-def test_the_plan_says_when_the_model_begins(changes: Mapping[str, Any], told: str) -> None:
-    assert fact(**changes) == f"gp: its model proposes points once {told}"
+def test_the_plan_says_when_the_model_begins(changes: Mapping[str, Any], at_once: int, told: str) -> None:
+    assert fact(at_once, **changes) == f"gp: its model proposes points once {told}"

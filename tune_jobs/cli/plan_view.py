@@ -69,7 +69,7 @@ def _plan_facts(spec: SweepSpec, plan: SweepPlan, *, finish: bool) -> dict[str, 
         "engine": _engine_fact(plan),
         "at once": f"{_at_once(plan)}; {machine.source} has {has}",
         "a trial stops at": " or ".join(rules),
-        "search": search_fact(spec),
+        "search": search_fact(spec, plan.max_concurrent if plan.packs is None else plan.packs.max_concurrent),
         "scheduler": _scheduler_fact(spec),
         "then": _confirm_fact(race) if finish else "nothing (--no-finish)",
         "env steps": _env_steps_fact(plan, race),
@@ -116,12 +116,19 @@ def _resources(cpus: float, gpus: float) -> str:
     return f"{cpus:g} CPU{'s' * (cpus > 1)}" + (f" and {gpus:g} GPU{'s' * (gpus > 1)}" if gpus else "")
 
 
-def search_fact(spec: SweepSpec) -> str:
-    """Return what a plan says of how points are chosen."""
+def search_fact(spec: SweepSpec, at_once: int) -> str:
+    """Return what a plan says of how points are chosen.
+
+    Args:
+        spec: The sweep.
+        at_once: How many trials run at once.
+    """
     if not spec.search.has_model:
         return "random draws for each combination of the grids"
     wanted, ended = spec.search.num_startup_trials, ", those of prior among them" if spec.prior else ""
-    if spec.scheduler.type != "none" and (most := most_needed(wanted, len(spec.points) + spec.num_samples)) > wanted:
+    # One place is free when a point is chosen.
+    running = -(-at_once // spec.seeds_per_point) - 1
+    if spec.scheduler.type != "none" and (most := most_needed(wanted, spec.num_samples, running)) > wanted:
         ended += f", or fewer that were trained for as long as {wanted} whole ones"
         wanted = most
     return f"{spec.search.type}: its model proposes points once {wanted} have ended{ended}"

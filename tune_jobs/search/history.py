@@ -155,8 +155,11 @@ def tell_scores(records: Sequence[TrialRecord]) -> bool | None:
 
 
 def _trained(spec: SweepSpec, record: TrialRecord) -> float:
-    """Return the share of its whole training that a trial has had; only what a scheduler ended counts as less."""
-    if record.status != "stopped":
+    """Return the share of its training that a trial has had: less than 1 if a scheduler ended it, or, with one, failed.
+
+    Without a scheduler all are whole: what failed tells as much as it ever will, and nothing was ended early.
+    """
+    if record.status == "completed" or spec.scheduler.type == "none":
         return 1.0
     whole = whole_length(
         record.point, record.hyperparams, num_env_steps=spec.stop.num_env_steps, num_iterations=spec.stop.num_iterations

@@ -57,6 +57,7 @@ def prior_record(spec: SweepSpec, name: str, earlier: SweepSpec, trials: Sequenc
                     point=point,
                     share=None if known.score is None else float(share),
                     env_steps=_mean_cost(known, earlier),
+                    trained=known.trained,
                 )
             )
     if not kept:
@@ -180,7 +181,8 @@ def with_prior(known: Sequence[KnownPoint], prior: Sequence[PriorRecord]) -> lis
         point if point.is_running else KnownPoint(point.point, (_share_of(point, next(shares)),), trained=point.trained)
         for point in known
     ]
-    return [*(KnownPoint(item.point, (item.share,), is_own=False) for item in earlier), *own]
+    told = (KnownPoint(item.point, (item.share,), trained=item.trained, is_own=False) for item in earlier)
+    return [*told, *own]
 
 
 def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint], num_failed: int) -> KnownPoint:
@@ -193,7 +195,7 @@ def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint], num_failed:
         num_failed: How many of them failed.
     """
     if item.share is None:
-        return KnownPoint(item.point, (None,), is_own=False)
+        return KnownPoint(item.point, (None,), trained=item.trained, is_own=False)
     place = max(item.share * (len(ordered) - 1), num_failed)
     worse, better = ordered[math.floor(place)], ordered[math.ceil(place)]
     part = place - math.floor(place)
@@ -201,7 +203,7 @@ def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint], num_failed:
     score = nearest.score
     if worse.level == better.level and worse.score is not None and better.score is not None:
         score = worse.score * (1.0 - part) + better.score * part
-    return KnownPoint(item.point, (score,), level=nearest.level, is_own=False)
+    return KnownPoint(item.point, (score,), level=nearest.level, trained=item.trained, is_own=False)
 
 
 def _share_of(point: KnownPoint, share: float) -> float | None:

@@ -130,7 +130,7 @@ def propose_point(
         prior = [weighed_prior(each, drawn_index, spec.seed) for each in prior]
     return next_point(
         spec.search.type, spec.space, with_prior(known, prior), drawn_index, seed=spec.seed,
-        num_startup_trials=spec.search.num_startup_trials, num_points=len(spec.points) + spec.num_samples, check=check,
+        num_startup_trials=spec.search.num_startup_trials, num_points=spec.num_samples, check=check,
     )  # fmt: skip
 
 
@@ -156,8 +156,8 @@ def next_point(
         num_startup_trials: How many points have to end before a model proposes points; until then they are random, and
             as long as all that ended are equally good. Those that a scheduler ended count for the share of their
             training that they have had (decision 40).
-        num_points: How many points there will be in all: when a third of them have ended, a model proposes the next
-            ones however little these were trained. None: not known.
+        num_points: How many points the search will give in all: when a third of those that don't run have ended, a
+            model proposes the next ones however little these were trained. None: not known.
         check: Raises SpecError for a point whose values contradict each other; then another is proposed, except by
             `random`, whose points are all known and checked before.
 

@@ -20,20 +20,21 @@ def is_enough(known: Sequence[KnownPoint], num_startup_trials: int, num_points: 
     Args:
         known: What was tried before, and what is being tried.
         num_startup_trials: `search.num_startup_trials`.
-        num_points: How many points there will be in all; None: not known.
+        num_points: How many points the search will give in all; None: not known.
     """
     ended = [point for point in known if not point.is_running]
     if len(ended) < num_startup_trials:
         return False
-    if num_points is not None and len(ended) >= most_needed(num_startup_trials, num_points):
+    if num_points is not None and len(ended) >= most_needed(num_startup_trials, num_points, len(known) - len(ended)):
         return True
     # Sums of shares are off by rounding.
     return sum(point.trained for point in ended) >= num_startup_trials - 1e-9
 
 
-def most_needed(num_startup_trials: int, num_points: int) -> int:
+def most_needed(num_startup_trials: int, num_points: int, num_running: int) -> int:
     """Return how many points have to end at most before a model is asked, however little they were trained: a third.
 
-    Otherwise it would never be asked where a scheduler ends nearly all of a small sweep's points.
+    Otherwise it would never be asked where a scheduler ends nearly all of a small sweep's points. What runs was chosen
+    without having ended: of many that run at once a third of all would leave the model none to propose.
     """
-    return max(num_startup_trials, math.ceil(num_points / 3))
+    return max(num_startup_trials, math.ceil((num_points - num_running) / 3))

@@ -144,8 +144,8 @@ class SearchSpec(Section):
     num_startup_trials: PositiveWhole = Field(
         10,
         description="gp, forest, tpe: how many points have to end before the model proposes points; until then they "
-        "are random, and as long as all that ended are equally good. One that a scheduler ended counts for the share "
-        "of its training that it has had, until a third of all points have ended.",
+        "are random, and as long as all that ended are equally good. With a scheduler, one that it ended or that "
+        "failed counts for the share of its training that it has had, until a third of all that don't run have ended.",
     )
 
     @property
