@@ -21,6 +21,7 @@ from policies.suggestions import did_you_mean
 from policies.wrong_values import details_of, dotted, explain
 from tune_jobs.spec.domains import Domain, Layers, Listed, Range
 from tune_jobs.spec.list_forms import list_to_write, text_of_several
+from tune_jobs.spec.other_names import section_of
 from tune_jobs.spec.plain_data import yaml_text
 from tune_jobs.spec.problems import SPEC_HINT, Problem
 from tune_jobs.spec.sections import StopSpec
@@ -136,7 +137,7 @@ def _unknown_hyperparam(algorithm: Algorithm, name: str) -> str:
     have = "have" if len(others) > 1 else "has"
     of_others = f" ({' and '.join(others)} {have} it.)" if others else ""
     # By its letters, DQN's learning_starts would be nearer to learning_rate than lr is.
-    suggestion = answer_to(algorithm, name) or of_others or answer_for_others(algorithm, name)
+    suggestion = answer_to(algorithm, name) or of_others or answer_for_others(algorithm, name) or section_of(name)
     for part in name.split(".")[::-1]:  # as a whole, `lr.loguniform` is near to nothing, or to something else
         suggestion = suggestion or did_you_mean(part, known)
     listed = "" if suggestion else f" It has {', '.join(sorted(known))}."

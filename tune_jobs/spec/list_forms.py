@@ -51,6 +51,8 @@ def text_of_several(name: str, value: Any, is_allowed: Callable[[Any], bool]) ->
 def text_of_no_domain(name: str, value: Any) -> str | None:
     """Return how to write a domain in the place of a list or of one value; None: it is neither."""
     if isinstance(value, list | tuple) and value:
+        if len(value) == 1 and isinstance(value[0], Mapping) and set(value[0]) & set(DOMAIN_KINDS):
+            return f"{shortened(value)} is a list of one domain: write {shortened(value[0])} alone, without the dash"
         if name == "hidden_sizes" and all(type(size) is int for size in value):
             network = f"{{grid: [{_written(value)}]}} for one network of {_layers(len(value))}"
             each = f"{{grid: {_written([[size] for size in value])}}} to try each as one layer, or "

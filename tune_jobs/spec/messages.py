@@ -19,6 +19,7 @@ from tune_jobs.spec.domains import DOMAIN_KINDS, Domain
 from tune_jobs.spec.hyperparam_problems import hyperparam_problems
 from tune_jobs.spec.layers import LayersFields
 from tune_jobs.spec.list_forms import text_of_no_domain, text_of_no_list
+from tune_jobs.spec.other_names import meant_by, place_of
 from tune_jobs.spec.problems import Problem
 from tune_jobs.spec.sections import NAME_RULE, SweepFields
 from tune_jobs.spec.slips import text_of_no_space
@@ -147,7 +148,7 @@ def _unknown_key(location: Sequence[int | str]) -> str:
     if "." in name:
         return f"there is no field {name!r} here{_of_a_path(name, model)}"
     # A field of exactly this name in another section is more likely meant than a similar one here.
-    suggestion = _other_place(name) or did_you_mean(name, model.model_fields)
+    suggestion = meant_by(location[:-1], name) or did_you_mean(name, model.model_fields)
     listed = "" if suggestion else f" Known here: {', '.join(model.model_fields)}."
     arguments = " Arguments of the environment go under env.args." if list(location[:-1]) == ["env"] else ""
     return f"there is no field {name!r} here.{suggestion}{listed}{arguments}"
@@ -179,7 +180,7 @@ def _of_a_path(name: str, model: type[BaseModel]) -> str:
     inner = _type_of(model, head) if head in model.model_fields else None
     if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
         return f".{did_you_mean(head, model.model_fields)}"
-    return f", nor {rest!r} in {head}.{_other_place(rest) or did_you_mean(rest, inner.model_fields)}"
+    return f", nor {rest!r} in {head}.{place_of(rest) or did_you_mean(rest, inner.model_fields)}"
 
 
 def _in_braces(name: str, model: type[BaseModel]) -> str | None:
@@ -200,18 +201,3 @@ def _in_domain(name: str) -> str:
     """Return a dotted name below the space as a mapping: `lr: {loguniform: ...}`."""
     searched, _, inner = name.rpartition(".")
     return f"{searched}: {{{inner}: ...}}" if searched and inner in (*DOMAIN_KINDS, "when") else f"{name}: ..."
-
-
-def _other_place(name: str) -> str:
-    """Return a hint for a field that exists in another section."""
-    places = [
-        f"{section}.{name}"
-        for section, field in SweepFields.model_fields.items()
-        if section != "about"  # its strings are not settings
-        and isinstance(field.annotation, type)
-        and issubclass(field.annotation, BaseModel)
-        and name in field.annotation.model_fields
-    ]
-    if any(name in model.model_fields for model in HYPERPARAMS_BY_ALGORITHM.values()):
-        places += [f"hyperparams.{name}", f"space.{name}"]
-    return f" Did you mean {' or '.join(places)}?" if places else ""

@@ -119,6 +119,8 @@ class _Copy:
             copied = {}
             for key, item in value.items():
                 name = self._key(key, path)
+                if name in copied:
+                    raise self._error(path, f"has the key {name!r} twice, as a number and as a text", "Keep one.")
                 copied[name] = self.of(item, f"{path}.{name}" if path else name)
             return copied
         finally:

@@ -9,8 +9,10 @@ are built. Everything else is PyYAML's; decision 26 says why no other library re
 from __future__ import annotations
 
 import itertools
+import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple, NoReturn
 
 import yaml
@@ -58,7 +60,7 @@ def parse_yaml(text: str, label: str) -> Any:
     if len(text) > MAX_CHARACTERS:
         raise SpecError(f"{label}: has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read.", _SMALLER)
     try:
-        return _Loader(text).get_single_data()
+        return _Loader(_without_tabs(text)).get_single_data()
     except yaml.MarkedYAMLError as error:
         # Some errors have one half in each: "expected a single document in the stream", "but found another document".
         told = ", ".join(filter(None, (error.context, error.problem)))
@@ -75,6 +77,18 @@ def parse_yaml(text: str, label: str) -> Any:
         ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SpecError(f"{label}: this is not YAML: {error}", "Correct the YAML.") from error
+
+
+def _without_tabs(text: str) -> str:
+    """Return a JSON text with spaces for its tabs, which YAML 1.2 takes there and PyYAML does not; others as they are.
+
+    JSON's texts hold no tabs, but escapes of them.
+    """
+    if "\t" in text and text.lstrip().startswith("{"):
+        with suppress(ValueError, RecursionError):
+            json.loads(text)
+            return text.replace("\t", " ")
+    return text
 
 
 def parse_value(text: str, label: str) -> Any:
