@@ -8,7 +8,7 @@ from pydantic import BaseModel
 from spec_errors import errors
 
 from policies.errors import SpecError
-from tune_jobs.spec.other_names import _MEANT, meant_by
+from tune_jobs.spec.other_names import MEANT, meant_by
 from tune_jobs.spec.plain_data import to_plain
 from tune_jobs.spec.sections import SearchSpec, StopSpec, SweepFields
 from tune_jobs.spec.yaml import parse_yaml
@@ -17,7 +17,7 @@ FIELDS: dict[str, type[BaseModel]] = {"": SweepFields, "search": SearchSpec, "st
 
 
 def test_the_table_names_fields_that_exist_and_none_that_is_one_itself() -> None:
-    for section, names in _MEANT.items():
+    for section, names in MEANT.items():
         fields = FIELDS[section].model_fields
         for name, meant in names.items():
             assert name not in fields

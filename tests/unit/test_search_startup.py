@@ -69,9 +69,7 @@ def test_running_points_count_for_nothing_and_few_whole_ones_are_not_enough() ->
 def test_of_many_that_run_at_once_the_model_proposes_some() -> None:
     """96 points, of which 64 run at once, all of which end at the first rung."""
     spec = make_spec(num_samples=96, startup=10, method="gp", **ASHA)
-    running = [
-        record(index, draw_point(spec.space, index, spec.seed), status="running") for index in range(96)
-    ]  # fmt: skip
+    running = [record(index, draw_point(spec.space, index, spec.seed), status="running") for index in range(96)]
     asked = [
         is_enough(known_points(spec, [*trials(spec, *[WHOLE // 20] * ended), *running[ended : ended + 63]]), 10, 96)
         for ended in range(33)

@@ -16,7 +16,7 @@ from tune_jobs.spec.sections import SweepFields
 
 _FIXED_OR_SEARCHED = "values that are fixed go under hyperparams, and what is searched under space"
 _NO_METRIC = "a setting is judged by its evaluation returns, higher is better; objective says how"
-_MEANT: Mapping[str, Mapping[str, str]] = {
+MEANT: Mapping[str, Mapping[str, str]] = {
     "": {
         "config": _FIXED_OR_SEARCHED,
         "direction": _NO_METRIC,
@@ -68,7 +68,7 @@ def meant_by(location: Sequence[int | str], name: str) -> str:
         name: The name, which is no field there.
     """
     section = ".".join(map(str, location))
-    meant = _MEANT.get(section, {}).get(name)
+    meant = MEANT.get(section, {}).get(name)
     if meant is not None:
         return f" {meant[0].upper()}{meant[1:]}." if " " in meant else f" Did you mean {meant!r}?"
     return place_of(name) or ("" if location else _hyperparam(name))
