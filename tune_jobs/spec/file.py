@@ -21,6 +21,7 @@ from tune_jobs.spec.fields import Section
 from tune_jobs.spec.plain_data import MAX_CHARACTERS, to_plain
 from tune_jobs.spec.problems import SPEC_HINT, Problem, WrongSpecError
 from tune_jobs.spec.sections import AboutSpec
+from tune_jobs.spec.slips import text_of_no_mapping, text_of_parentheses
 from tune_jobs.spec.sweep_spec import STORED, SweepSpec
 from tune_jobs.spec.yaml import parse_value, parse_yaml
 from tune_jobs.store.names import SWEEP_RECORD
@@ -29,6 +30,7 @@ from tune_jobs.store.presence import is_file
 # The most bytes of a file, for the most characters that are read, at 4 bytes each.
 _MAX_BYTES = 4 * MAX_CHARACTERS
 _LENGTH = "How long a training is, in env steps; stop.num_env_steps is left out."
+_KINDS = {str: "one text", list: "a list"}
 _SECTIONS_OF_TEXT = {"about": "title", "env": "id", "objective": "type", "scheduler": "type", "search": "type"}
 """Sections that may be written as one string, and the field that it stands for."""
 
@@ -115,7 +117,7 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
         SpecError: There is no such file or preset, it is not YAML, or the sweep is wrong; the message lists every
             problem.
     """
-    label, data = _read(source)
+    label, data, text = _read(source)
     if overrides:
         set_paths = [_apply_override(data, override) for override in overrides]
         data = to_plain(data, f"{label} with --set")
@@ -125,8 +127,10 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
         return SweepSpec.model_validate(data)
     except WrongSpecError as error:
         found = error.problems
-    told = [Problem(path, f"{text}{' (from --set)' if _is_set(path, set_paths) else ''}") for path, text in found]
-    raise WrongSpecError.of(label, told)
+    told = [Problem(path, f"{what}{' (from --set)' if _is_set(path, set_paths) else ''}") for path, what in found]
+    # Where numbers in parentheses are cut at their commas, each part is a problem that leads elsewhere.
+    cause = text_of_parentheses(text)
+    raise WrongSpecError.of(label, told if cause is None else [Problem("", cause), *told])
 
 
 def stored_spec(record: SweepRecord) -> SweepSpec:
@@ -223,18 +227,18 @@ def _with_limits(schema: Any) -> Any:
     return {_LIMITS.get(key, key): _with_limits(value) for key, value in schema.items()}
 
 
-def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return a source's name for messages, and its content as plain JSON-like data."""
+def _read(source: str | Path | Mapping[str, Any]) -> tuple[str, dict[str, Any], str]:
+    """Return a source's name for messages, its content as plain JSON-like data, and its text, if it has one."""
     if isinstance(source, Mapping):
-        label, data = "sweep", source
+        label, data, text = "sweep", source, ""
     else:
         label, text = read_sweep_file(source)
         data = parse_yaml(text, label)
     if not isinstance(data, Mapping):
-        kind = "is empty" if data is None else f"holds a {type(data).__name__}"
-        raise SpecError(f"{label}: {kind}, not the fields of a sweep", SPEC_HINT)
+        kind = "is empty" if data is None else f"holds {_KINDS.get(type(data), 'one value')}"
+        raise SpecError(f"{label}: {kind}, not the fields of a sweep", text_of_no_mapping(text, data) or SPEC_HINT)
     plain: dict[str, Any] = to_plain(data, label)
-    return label, plain
+    return label, plain, text
 
 
 def read_sweep_file(source: str | Path) -> tuple[str, str]:

@@ -60,6 +60,11 @@ def _instead_of(value: Any, path: str) -> str:
             "Register it with gymnasium.register in a module of your own, and give the id after the module, as in "
             "my_envs:Name-v0."
         )
+    if path.startswith(("space.", "hyperparams.")):
+        return (
+            "Give values as they are, and write a domain as a mapping under space, as in {'lr': {'loguniform': [1e-5, "
+            "1e-3]}, 'num_epochs': {'grid': [4, 8]}}; no objects and no functions."
+        )
     return "Give texts, numbers, true or false, None, lists and mappings of them."
 
 

@@ -1,4 +1,4 @@
-"""Slips of the keyboard in a sweep file: say what to write in their place."""
+"""Slips of the keyboard in a sweep file, and what other languages have: say what to write in their place."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import math
 import re
 from typing import Any
 
+from policies.errors import shortened
+
 _WITHOUT_SPACE = re.compile(r"([A-Za-z_][\w.]*):(\S+)")
+_OF_TOML = re.compile(r"(?:\[[\w.]+\]|[\w.]+[ \t]*=[ \t]*\S.*)\Z")
+_NUMBER = r"[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_IN_PARENTHESES = re.compile(rf"\([ \t]*({_NUMBER}(?:[ \t]*,[ \t]*{_NUMBER})*)[ \t]*,?[ \t]*\)")
 _WITH_COMMAS = re.compile(r"[-+]?[0-9]{1,3}(?:,[0-9]{3})+")
 
 
@@ -14,6 +19,48 @@ def text_of_no_space(value: Any) -> str | None:
     """Return what to write for `lr:1e-3`, which YAML reads as one word; None: it is something else."""
     found = _WITHOUT_SPACE.match(value) if isinstance(value, str) else None
     return None if found is None else f"write a space after the colon, {found[1]}: {found[2]}"
+
+
+def text_of_no_mapping(text: str, data: Any) -> str | None:
+    """Return what to write where a whole sweep file is one text, or a list; None: it is not known.
+
+    Args:
+        text: The content of the file.
+        data: What YAML makes of it.
+    """
+    if isinstance(data, list):
+        return "Write the fields without dashes before them: a dash begins an item of a list."
+    if (meant := text_of_toml(text)) is not None:
+        return meant
+    spaced = text_of_no_space(text.strip())
+    return None if spaced is None else f"W{spaced[1:].splitlines()[0]}."
+
+
+def text_of_toml(text: str) -> str | None:
+    """Return how a sweep file is written where the first line of one is of TOML or Python; None: it is not.
+
+    Args:
+        text: The content of the file.
+    """
+    lines = (line.strip() for line in text.splitlines())
+    first = next((line for line in lines if line and not line.startswith("#")), "")
+    if _OF_TOML.match(first) is None:
+        return None
+    return f"Sweep files are YAML, as in `env: CartPole-v1`; the line {shortened(first)} is of another language."
+
+
+def text_of_parentheses(text: str) -> str | None:
+    """Return how to write the first numbers in parentheses, which YAML reads as words; None: there are none.
+
+    Args:
+        text: The content of a sweep file.
+    """
+    without_comments = re.sub(r"(?m)(?:^|(?<=[ \t]))#.*$", "", text)
+    found = _IN_PARENTHESES.search(without_comments)
+    if found is None:
+        return None
+    line = without_comments.count("\n", 0, found.start()) + 1
+    return f"line {line}: YAML has no {found[0]}: write [{found[1].strip()}]"
 
 
 def number_in(text: str) -> float | None:

@@ -20,6 +20,7 @@ from typing_extensions import override
 
 from policies.errors import SpecError
 from tune_jobs.spec.plain_data import MAX_CHARACTERS, MAX_DEPTH, MAX_DIGITS, MAX_VALUES
+from tune_jobs.spec.slips import text_of_no_space, text_of_toml
 
 _TAG = "tag:yaml.org,2002:"
 _NULL, _BOOL, _INT, _FLOAT, _STR = (f"{_TAG}{kind}" for kind in ("null", "bool", "int", "float", "str"))
@@ -68,7 +69,7 @@ def parse_yaml(text: str, label: str) -> Any:
             told = "there is a tab where YAML takes only spaces"
         mark = error.problem_mark
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise SpecError(f"{label}{place}: {told}", error.note or _CORRECT) from error
+        raise SpecError(f"{label}{place}: {told}", error.note or _instead_of(text, mark) or _CORRECT) from error
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise SpecError(
@@ -77,6 +78,17 @@ def parse_yaml(text: str, label: str) -> Any:
         ) from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SpecError(f"{label}: this is not YAML: {error}", "Correct the YAML.") from error
+
+
+def _instead_of(text: str, mark: yaml.Mark | None) -> str | None:
+    """Return what to write where a file is of another language, or the line before an error is `env:CartPole-v1`.
+
+    YAML takes the latter for the beginning of a text of several lines, in which there can be no field. None: it is
+    something else.
+    """
+    above = [line.strip() for line in text.splitlines()[: mark.line]] if mark is not None else []
+    spaced = text_of_no_space(above[-1]) if above else None
+    return text_of_toml(text) if spaced is None else f"In line {len(above)}, {spaced}."
 
 
 def _without_tabs(text: str) -> str:
