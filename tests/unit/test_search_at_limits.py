@@ -12,6 +12,7 @@ from test_search_methods import make_spec, record, valley
 from policies.errors import SpecError
 from tune_jobs.search import gaussian_process, gp
 from tune_jobs.search.coordinates import Cube
+from tune_jobs.search.fidelity import Lengths
 from tune_jobs.search.history import KnownPoint, known_points
 from tune_jobs.search.proposal import next_point
 from tune_jobs.search.two_objectives import weighed
@@ -77,9 +78,9 @@ def test_settings_of_the_process_are_found_anew_where_points_have_grown_by_a_ten
     gp._fitted.cache_clear()
     known = tried(110)
     for number in range(100, 110):
-        gp._settings(Cube(SPACE), known[:number])
+        gp._settings(Cube(SPACE), known[:number], Lengths.among(known))
     assert fitted == [100]
-    gp._settings(Cube(SPACE), known)
+    gp._settings(Cube(SPACE), known, Lengths.among(known))
     assert len(fitted) == 2
 
 

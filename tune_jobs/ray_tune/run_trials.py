@@ -47,6 +47,8 @@ from tune_jobs.ray_tune.trainable import TrialTrainable
 from tune_jobs.ray_tune.tune_events import PackEvents, TrialEvents, pack_id_of, trial_id_of
 from tune_jobs.ray_tune.tune_scheduler import TuneScheduler
 from tune_jobs.search.comparisons import comparisons_before
+from tune_jobs.search.gains import Evaluations
+from tune_jobs.search.rungs import TAKE_RUNGS
 from tune_jobs.spec.file import stored_spec
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.contract import Ownership, Sweep
@@ -187,7 +189,9 @@ class _Run:
         if searched:
             self._scheduler = self._build_scheduler()
             if spec.search.has_model:
-                self._chooser = PointChooser(spec, self._record, self.keeper.all_records, self.keeper.change)
+                reads = spec.scheduler.type != "none" and spec.search.type in TAKE_RUNGS
+                curves = Evaluations(self._store) if reads else None
+                self._chooser = PointChooser(spec, self._record, self.keeper.all_records, self.keeper.change, curves)
             self._stage(searched, "")
         if replicas and not (searched and self.keeper.stop_requested()):
             # They show what a setting gives when it is trained to the end: none of them is compared and ended.

@@ -16,6 +16,7 @@ from policies.hyperparams import Hyperparams
 from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.search.history import History
 from tune_jobs.search.proposal import propose_point
+from tune_jobs.search.rungs import ReadCurves
 from tune_jobs.spec.sweep_spec import SweepSpec
 from tune_jobs.store.transitions import begun, with_point
 
@@ -28,6 +29,7 @@ class PointChooser:
         sweep: Its record, which has the points that somebody chose: they are not drawn.
         records: Returns the newest records of all trials.
         change: Changes a trial's record, on disk too.
+        curves: As for `History`.
     """
 
     def __init__(
@@ -36,9 +38,10 @@ class PointChooser:
         sweep: SweepRecord,
         records: Callable[[], Sequence[TrialRecord]],
         change: Callable[[str, Callable[[TrialRecord], TrialRecord]], None],
+        curves: ReadCurves | None = None,
     ) -> None:
         self._spec, self._sweep = spec, sweep
-        self._history = History(spec)
+        self._history = History(spec, curves=curves)
         self._given: set[str] = set()
         self._records = records
         self._change = change

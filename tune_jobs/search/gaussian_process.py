@@ -135,11 +135,15 @@ class Posterior:
         awaited: Points whose scores are not known yet, shape (any, num_columns). They make the process surer of their
             surroundings, but don't change what it expects there (Desautels et al. 2014, "Parallelizing Exploration-
             Exploitation Tradeoffs with Gaussian Process Bandit Optimization").
+        tried: Where nothing is to be gained any more, shape (any, num_columns); None: at the observed and the awaited
+            points. Of trainings of several lengths it is each point as a whole training: one that was ended early would
+            be proposed again and again, as nothing is known of its end.
     """
 
     def __init__(
-        self, settings: Settings, group_of_column: NDArray[np.int64], observed: Observed, awaited: Floats
-    ) -> None:
+        self, settings: Settings, group_of_column: NDArray[np.int64], observed: Observed, awaited: Floats,
+        tried: Floats | None = None,
+    ) -> None:  # fmt: skip
         self._settings = settings
         self._by_length = 1.0 / settings.length_scales[group_of_column]
         self._num_observed = len(observed.means)
@@ -148,6 +152,9 @@ class Posterior:
         first = kernel[: self._num_observed, : self._num_observed] + np.diag(settings.noise / observed.counts + _JITTER)
         inverse = np.linalg.inv(np.linalg.cholesky(first))
         self._alpha = inverse.T @ (inverse @ observed.means)
+        self._tried = None if tried is None else tried * self._by_length
+        if self._tried is not None:
+            kernel = self._kernel(self._tried, self._tried)
         # Places that are nearly the same would make the matrix singular.
         apart = _NEARLY_THE_SAME * settings.scale * np.eye(len(kernel))
         self._inverse = np.linalg.inv(np.linalg.cholesky(kernel + apart))
@@ -165,7 +172,10 @@ class Posterior:
 
     def at(self, columns: Floats) -> tuple[Floats, Floats]:
         """Return what is expected of points and how far off that may be, as deviation, each of shape (num_points,)."""
-        kernel = self._kernel(columns * self._by_length, self._seen)
+        places = columns * self._by_length
+        kernel = self._kernel(places, self._seen)
         mean = kernel[:, : self._num_observed] @ self._alpha
+        if self._tried is not None:
+            kernel = self._kernel(places, self._tried)
         variance = self._settings.scale - ((kernel @ self._inverse.T) ** 2).sum(1)
         return mean, np.sqrt(np.maximum(variance, 1e-12))

@@ -18,6 +18,7 @@ from policies import random_streams
 from tune_jobs.search.asking import Check, Question
 from tune_jobs.search.candidates import best_point
 from tune_jobs.search.coordinates import Cube
+from tune_jobs.search.fidelity import Lengths
 from tune_jobs.search.gaussian_process import Observed, Posterior, Settings, fit
 from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.improvement import log_expected_improvement
@@ -38,31 +39,37 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     Raises:
         SpecError: None of many points is valid.
     """
-    cube = Cube(question.space)
+    cube, lengths = Cube(question.space), Lengths.among(question.known)
     rng = random_streams.model_draws(question.seed, question.index)
-    settings = _settings(cube, question.known)
-    seen, units = observed(cube, question.known, _MOST_GIVEN)
+    told = lengths.told(question.known)
+    settings = _settings(cube, told, lengths)
+    seen, units = observed(cube, told, _MOST_GIVEN, lengths)
     awaited = cube.units([point.point for point in question.known if point.is_running])
-    posterior = Posterior(settings, cube.group_of_column, seen, cube.columns(awaited))
+    places = lengths.places(np.concatenate([units, awaited]))
+    whole = lengths.of_whole(cube.columns(places))
+    posterior = Posterior(
+        settings, lengths.groups(cube), seen, lengths.of_whole(cube.columns(awaited)),
+        tried=whole if lengths.is_column else None,
+    )  # fmt: skip
     # What runs is expected to be as good as the model says: to be equal to it is no improvement.
-    expected = posterior.mean_at_given()
+    expected = posterior.at(whole)[0] if lengths.is_column else posterior.mean_at_given()
     best = float(expected.max()) + _MARGIN
-    near = np.concatenate([units, awaited])[np.argsort(-expected, kind="stable")[:10]]
+    near = places[np.argsort(-expected, kind="stable")[:10]]
 
     def promise(columns: Floats) -> Floats:
-        return log_expected_improvement(*posterior.at(columns), best)
+        return log_expected_improvement(*posterior.at(lengths.of_whole(columns)), best)
 
     return best_point(cube, question, promise, near, rng=rng, check=check)
 
 
-def _settings(cube: Cube, known: Sequence[KnownPoint]) -> Settings:
+def _settings(cube: Cube, known: Sequence[KnownPoint], lengths: Lengths) -> Settings:
     """Return the settings of the process, of the first points that ended, whose number grows by tenths."""
     num_ended = sum(not point.is_running for point in known)
     num_first = _by_tenths(num_ended)
     ended = [point for point in known if not point.is_running]
     first = [point for point in known[:num_first] if not point.is_running]
-    seen, _ = observed(cube, first or ended, _MOST_FITTED)
-    groups = tuple(map(int, cube.group_of_column))
+    seen, _ = observed(cube, first or ended, _MOST_FITTED, lengths)
+    groups = tuple(map(int, lengths.groups(cube)))
     return _fitted(seen.columns.tobytes(), seen.means.tobytes(), seen.counts.tobytes(), seen.spread, groups)
 
 

@@ -6,6 +6,7 @@ A point is known to a method by its values, by what became of each of its seeds,
   evaluation return; None for one that failed or showed nothing that can be scored, which counts as worse than all that
   did. A sweep begun by a former version, whose processes told none, goes on with the best evaluations;
 - ended early by a scheduler: the same, and the rung that its first trial reached;
+- with a scheduler, also of its seeds that have ended what they had come to at the rungs that they passed;
 - running: the scores of those seeds that have ended, which are not like the others: what is solved ends early;
 - planned, but not begun, or chosen by somebody with a value that the search could not give: nothing, as a model has no
   place for it.
@@ -18,13 +19,14 @@ import math
 import operator
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from analysis.objectives import env_steps_of
 from analysis.records import FINISHED, Objective, TrialRecord, whole_length
 from analysis.selection import score_trial
 from tune_jobs.search.chosen_point import outside
+from tune_jobs.search.rungs import Passed, ReadCurves, passed
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 TOLD: tuple[Objective, ...] = ("area", "steps_to_threshold")
@@ -47,6 +49,8 @@ class KnownPoint:
     """The rung at which a scheduler ended it; None: none did."""
     trained: float = 1.0
     """The share of its training that it has had, the mean over its ended seeds: below 1 if a scheduler ended it."""
+    passed: tuple[Passed, ...] = ()
+    """What it had come to at the rungs that it passed; empty: not known, or none."""
     is_own: bool = True
     """Whether it is one of this sweep; one of an earlier sweep tells a model as much, but was never tried in this."""
 
@@ -67,10 +71,12 @@ class History:
     Args:
         spec: The sweep.
         with_outside: Whether points that its search could not have given are told, too, as to another sweep's.
+        curves: Returns the evaluations of trials, from which follows what points had come to at the rungs that they
+            passed; None: that is not told.
     """
 
-    def __init__(self, spec: SweepSpec, *, with_outside: bool = False) -> None:
-        self._spec, self._with_outside = spec, with_outside
+    def __init__(self, spec: SweepSpec, *, with_outside: bool = False, curves: ReadCurves | None = None) -> None:
+        self._spec, self._with_outside, self._curves = spec, with_outside, curves
         self._by_objective: bool | None = None
         self._seen: dict[int, tuple[list[TrialRecord], KnownPoint | None]] = {}
         """By point, its trials as they were when it was looked at, and what they told."""
@@ -102,8 +108,17 @@ class History:
         score = _objective_score if self._by_objective else _best_evaluation
         is_told = self._with_outside or not outside(self._spec.space, members[0].point)
         found = _known(self._spec, sorted(members, key=lambda record: record.index), score) if is_told else None
+        if found is not None and self._curves is not None and not (found.is_running or self._by_objective):
+            found = replace(found, passed=self._passed(members))
         self._seen[index] = members, found
         return found
+
+    def _passed(self, members: Sequence[TrialRecord]) -> tuple[Passed, ...]:
+        assert self._curves is not None
+        ended = [record for record in members if record.status in FINISHED]
+        if any(record.status == "failed" for record in ended):
+            return ()
+        return passed(self._spec, ended, self._curves([record.trial_id for record in ended]))
 
 
 def known_points(spec: SweepSpec, records: Sequence[TrialRecord]) -> list[KnownPoint]:

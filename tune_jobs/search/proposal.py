@@ -10,9 +10,9 @@ of the methods, needs neither Ray nor a folder:
         known.append(KnownPoint(point, scores=(train(point, seed=0), train(point, seed=1), None)))
 
 A `KnownPoint` (`tune_jobs.search.history`) is a point, the scores of its seeds (None: that one failed), whether it
-still runs (`is_running=True`: others are proposed meanwhile) and, if it was ended early, the rung that it reached and
-the share of its training that it has had. One that somebody else tried (`is_own=False`) tells as much, and may be
-proposed.
+still runs (`is_running=True`: others are proposed meanwhile), what it had come to at the rungs of a scheduler that it
+passed, and, if it was ended at one, that rung and the share of its training that it has had. One that somebody else
+tried (`is_own=False`) tells as much, and may be proposed.
 
 One more method is one more module with a function that is a `tune_jobs.search.asking.Method`, a row of `_METHODS`, and
 its name in `tune_jobs.spec.sections`.

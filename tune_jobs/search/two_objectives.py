@@ -57,8 +57,11 @@ def weighed(known: Sequence[KnownPoint], index: int, seed: int) -> list[KnownPoi
         losses = weight * _tamed((best / 2 - score / 2) / scores), (1.0 - weight) * ((cost - least) / costs)
         return -(max(losses) + _RHO * sum(losses))
 
+    # What a point had come to at rungs has no cost that could be set against another's.
     return [
-        replace(point, scores=tuple(number(*pair) for pair in zip(point.scores, point.env_steps, strict=True)))
+        replace(
+            point, scores=tuple(number(*pair) for pair in zip(point.scores, point.env_steps, strict=True)), passed=()
+        )
         for point in known
     ]
 

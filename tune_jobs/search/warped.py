@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tune_jobs.search.coordinates import Cube
+from tune_jobs.search.fidelity import NO_COLUMN, Lengths
 from tune_jobs.search.gaussian_process import Observed
 from tune_jobs.search.history import KnownPoint
 
@@ -38,7 +39,7 @@ class Warped(NamedTuple):
     """The sum of the squared differences between the scores of a point's seeds, warped in the same way, and its own."""
 
 
-def warped(known: Sequence[KnownPoint]) -> Warped:
+def warped(known: Sequence[KnownPoint], *, by_level: bool = True) -> Warped:
     """Return the scores that a model is told.
 
     Points with a seed that failed, or was never scored, are worse than all without, the more of them the worse. Points
@@ -47,14 +48,16 @@ def warped(known: Sequence[KnownPoint]) -> Warped:
 
     Args:
         known: Points that have ended.
+        by_level: False: those that a scheduler ended are compared with the others by their scores, as a model is that
+            is told the lengths of their trainings.
     """
-    table = _table(known)
+    table = _table(known, by_level=by_level)
     shares = _shares(table)
     scores = _with_distances(_normal_quantiles(shares), table, shares)
     scores = scores - scores.mean()
     if (deviation := float(scores.std())) > 0:
         scores = scores / deviation
-    return _with_seeds(known, scores)
+    return _with_seeds(known, scores, by_level=by_level)
 
 
 def shares_of(known: Sequence[KnownPoint]) -> Floats:
@@ -66,9 +69,12 @@ def shares_of(known: Sequence[KnownPoint]) -> Floats:
     return _shares(_table(known))
 
 
-def _table(known: Sequence[KnownPoint]) -> Floats:
+def _table(known: Sequence[KnownPoint], *, by_level: bool = True) -> Floats:
     """Return what `rank_of` says of points, shape (num_points, 2)."""
-    return np.fromiter(itertools.chain.from_iterable(map(rank_of, known)), np.float64).reshape(-1, 2)
+    table = np.fromiter(itertools.chain.from_iterable(map(rank_of, known)), np.float64).reshape(-1, 2)
+    if not by_level:
+        table[table[:, 0] >= 0, 0] = math.inf
+    return table
 
 
 def _shares(table: Floats) -> Floats:
@@ -113,9 +119,11 @@ def _with_finite_differences(values: Floats) -> Floats:
     return values / 2.0 if math.isinf(float(values.max()) - float(values.min())) else values
 
 
-def _with_seeds(known: Sequence[KnownPoint], scores: Floats) -> Warped:
+def _with_seeds(known: Sequence[KnownPoint], scores: Floats, *, by_level: bool) -> Warped:
     counts, spreads = np.ones(len(known)), np.zeros(len(known))
-    compared = [index for index, point in enumerate(known) if point.level is None and point.score is not None]
+    compared = [
+        index for index, point in enumerate(known) if (point.level is None or not by_level) and point.score is not None
+    ]
     several = [index for index in compared if len(known[index].scores) > 1]
     if several:
         means, first = np.unique([known[index].score for index in compared], return_index=True)
@@ -126,19 +134,23 @@ def _with_seeds(known: Sequence[KnownPoint], scores: Floats) -> Warped:
     return Warped(scores, counts, spreads)
 
 
-def observed(cube: Cube, known: Sequence[KnownPoint], most: int) -> tuple[Observed, Floats]:
+def observed(
+    cube: Cube, known: Sequence[KnownPoint], most: int, lengths: Lengths = NO_COLUMN
+) -> tuple[Observed, Floats]:
     """Return what a model is given of points, and their places in the cube, shape (at most `most`, num_sides).
 
     Args:
         cube: The search space.
         known: All points; those that run are left out, because the seeds that end first are not like the others.
         most: How many points the model takes: the best ones, the newest, and some of the others.
+        lengths: The column by which the model knows how far trainings went, if it has one.
     """
     ended = [point for point in known if not point.is_running]
-    scores, counts, spreads = warped(ended)
+    scores, counts, spreads = warped(ended, by_level=not lengths.is_column)
     chosen = _some(scores, most)
     units = cube.units([ended[index].point for index in chosen])
-    return Observed(cube.columns(units), scores[chosen], counts[chosen], float(spreads[chosen].sum())), units
+    columns = lengths.beside(cube.columns(units), [ended[index] for index in chosen])
+    return Observed(columns, scores[chosen], counts[chosen], float(spreads[chosen].sum())), units
 
 
 def _some(means: Floats, most: int) -> NDArray[np.int64]:

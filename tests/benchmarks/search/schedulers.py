@@ -21,6 +21,7 @@ from tune_jobs.plan.points import point_hyperparams
 from tune_jobs.search.gains import Score
 from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.proposal import next_point
+from tune_jobs.search.rungs import Passed
 from tune_jobs.spec.file import load_spec
 from tune_jobs.spec.scheduler import SchedulerSpec
 from tune_jobs.store.transitions import with_change
@@ -159,6 +160,8 @@ class _Asha:
         self._scores: dict[str, float] = {}
         self._ended: dict[str, KnownPoint] = {}
         """What a model is told of each point that does not train any more."""
+        self._passed: dict[str, list[Passed]] = {}
+        """What each point that trains had come to at the rungs that it passed."""
         self._told: list[tuple[str, int, float, str]] = []
         self._per_iteration = 0
         self._left = 0
@@ -242,11 +245,13 @@ class _Asha:
                 self._rule.ended(standing)
                 level = None if has_ended else int(math.log(steps / self._first_rung, self._factor) + 1e-9)
                 self._ended[name] = KnownPoint(
-                    self._points[int(name[1:])], tuple(returns[name]), level=level, trained=min(1.0, steps / self._cap)
-                )
+                    self._points[int(name[1:])], tuple(returns[name]), level=level, trained=min(1.0, steps / self._cap),
+                    passed=() if None in returns[name] else tuple(self._passed.get(name, ())),
+                )  # fmt: skip
                 self._trainer.remove(name)
                 del self._rungs[name]
                 continue
+            self._passed.setdefault(name, []).append(Passed(steps / self._cap, score))
             while self._rungs[name] <= steps:
                 self._rungs[name] *= self._factor
 
