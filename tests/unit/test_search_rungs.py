@@ -131,7 +131,7 @@ def test_a_model_has_the_column_where_points_were_ended_and_rungs_are_known() ->
     for known in ([], [ENDED], [WENT_ON], [ENDED, plain], [FAILED, WENT_ON]):
         assert not Lengths.among(known).is_column
     assert [length_of(each) for each in (ENDED, WENT_ON, FAILED)] == [0.05, 1.0, 1.0]
-    assert length_of(KnownPoint({}, (1.0,), level=0, trained=0.0)) == 1e-3
+    assert length_of(KnownPoint({}, (1.0,), level=0, trained=0.0)) == 1e-6
 
 
 def test_scores_are_compared_whatever_their_lengths_which_stand_in_the_last_column() -> None:
@@ -231,12 +231,41 @@ def test_what_points_had_come_to_at_rungs_changes_what_is_proposed() -> None:
     assert proposed(higher) != proposed(known)
 
 
+def test_what_was_ended_is_tried_beside_many_points_that_have_rungs() -> None:
+    """150 whole points of three rungs each, and 24 of another kind that ended at the first, where they were worse."""
+    space = make_spec(space={"gamma": {"uniform": [0.0, 1.0]}, "gae_lambda": {"uniform": [0.0, 1.0]}}).space
+    found = []
+    for seed in range(5):
+        rng, known = np.random.default_rng(seed), []
+        for index in range(174):
+            lam = float(rng.uniform())
+            if 75 <= index < 99:
+                gamma = float(rng.uniform(0.75, 1.0))
+                ended = KnownPoint({"gamma": gamma, "gae_lambda": lam}, (-10.0 + rng.normal(),), level=0, trained=0.05)
+                known.append(ended)
+                continue
+            gamma = float(rng.uniform(0.0, 0.7))
+            end = 10 - 40 * ((gamma - 0.3) ** 2 + (lam - 0.5) ** 2)
+            rungs = tuple(Passed(share, end - off + rng.normal()) for share, off in ((0.05, 25), (0.15, 12), (0.45, 4)))
+            known.append(KnownPoint({"gamma": gamma, "gae_lambda": lam}, (end + rng.normal() / 2,), passed=rungs))
+        found += [next_point("gp", space, known, 174 + k, seed=seed)["gamma"] for k in range(2)]
+    assert np.mean(np.array(found) > 0.72) <= 0.3
+
+
+def test_seeds_that_are_equal_have_their_own_mean() -> None:
+    seeds = [trial(index, WHOLE, status="completed") for index in range(6)]
+    curves = {each.trial_id: curve((FIRST, -200.0), (WHOLE, -200.0)) for each in seeds}
+    ((_, score),) = passed(SPEC, seeds, curves)
+    assert score == -200.0
+
+
 def test_a_point_of_an_earlier_sweep_has_the_length_of_the_own_point_of_its_rank() -> None:
     own = [KnownPoint({"lr": 0.01 * k}, (float(k),), level=0, trained=0.05) for k in range(12)]
     own += [KnownPoint({"lr": 0.5 + 0.01 * k}, (float(k),)) for k in range(12)]
     points = tuple(PriorPointRecord(point={"lr": 0.3}, share=share, trained=0.6) for share in (0.1, 0.9))
     found = with_prior(own, [PriorRecord(sweep="earlier", env_id="CartPole-v1", points=points)])[:2]
-    assert [(point.level, point.trained) for point in found] == [(0, 0.05), (None, 0.6)]
+    # For when the model is asked they count as they were trained themselves.
+    assert [(point.level, point.trained) for point in found] == [(0, 0.6), (None, 0.6)]
     assert [length_of(point) for point in found] == [0.05, 1.0]
 
 

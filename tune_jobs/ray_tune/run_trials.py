@@ -189,7 +189,8 @@ class _Run:
         if searched:
             self._scheduler = self._build_scheduler()
             if spec.search.has_model:
-                reads = spec.scheduler.type != "none" and spec.search.type in TAKE_RUNGS
+                ends_early = spec.scheduler.type != "none" and spec.objective.cost is None
+                reads = ends_early and spec.search.type in TAKE_RUNGS
                 curves = Evaluations(self._store) if reads else None
                 self._chooser = PointChooser(spec, self._record, self.keeper.all_records, self.keeper.change, curves)
             self._stage(searched, "")

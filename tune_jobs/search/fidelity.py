@@ -21,7 +21,7 @@ from tune_jobs.search.history import KnownPoint
 Floats = NDArray[np.float64]
 _FACTOR = 20.0
 """Trainings whose lengths differ by this factor are as far apart as the ends of a range of the space."""
-_SHORTEST = 1e-3
+_SHORTEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -85,4 +85,6 @@ def length_of(point: KnownPoint) -> float:
 
     What failed would not have come further.
     """
-    return 1.0 if point.level is None or point.score is None else max(point.trained, _SHORTEST)
+    if point.level is None or point.score is None:
+        return 1.0
+    return max(point.trained if point.length is None else point.length, _SHORTEST)

@@ -45,6 +45,9 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     settings = _settings(cube, told, lengths)
     seen, units = observed(cube, told, _MOST_GIVEN, lengths)
     awaited = cube.units([point.point for point in question.known if point.is_running])
+    if lengths.is_column:
+        # Of points, not of what they had at rungs: what is left out here would be proposed again.
+        _, units = observed(cube, question.known, _MOST_GIVEN, lengths)
     places = lengths.places(np.concatenate([units, awaited]))
     whole = lengths.of_whole(cube.columns(places))
     posterior = Posterior(

@@ -26,7 +26,7 @@ from analysis.objectives import env_steps_of
 from analysis.records import FINISHED, Objective, TrialRecord, whole_length
 from analysis.selection import score_trial
 from tune_jobs.search.chosen_point import outside
-from tune_jobs.search.rungs import Passed, ReadCurves, passed
+from tune_jobs.search.rungs import Passed, ReadCurves, mean_of, passed
 from tune_jobs.spec.sweep_spec import SweepSpec
 
 TOLD: tuple[Objective, ...] = ("area", "steps_to_threshold")
@@ -49,6 +49,8 @@ class KnownPoint:
     """The rung at which a scheduler ended it; None: none did."""
     trained: float = 1.0
     """The share of its training that it has had, the mean over its ended seeds: below 1 if a scheduler ended it."""
+    length: float | None = None
+    """The share of a training after which its scores were reached; None: `trained`."""
     passed: tuple[Passed, ...] = ()
     """What it had come to at the rungs that it passed; empty: not known, or none."""
     is_own: bool = True
@@ -60,9 +62,7 @@ class KnownPoint:
         known = [score for score in self.scores if score is not None]
         if not known or len(known) < len(self.scores):
             return None
-        total = sum(known)
-        # The sum of scores near the ends of what a float can be may be infinite, where their mean is not.
-        return total / len(known) if math.isfinite(total) else sum(score / len(known) for score in known)
+        return mean_of(known)
 
 
 class History:

@@ -203,9 +203,10 @@ def _like_own(item: PriorPointRecord, ordered: Sequence[KnownPoint], num_failed:
     score = nearest.score
     if worse.level == better.level and worse.score is not None and better.score is not None:
         score = worse.score * (1.0 - part) + better.score * part
-    # A score of a rung is one after as much training as there.
-    trained = item.trained if nearest.level is None else nearest.trained
-    return KnownPoint(item.point, (score,), level=nearest.level, trained=trained, is_own=False)
+    # A score of a rung is one after as much training as there, however long the point itself was trained.
+    return KnownPoint(
+        item.point, (score,), level=nearest.level, trained=item.trained, length=nearest.trained, is_own=False
+    )
 
 
 def _share_of(point: KnownPoint, share: float) -> float | None:

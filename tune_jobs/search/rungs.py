@@ -50,12 +50,19 @@ def passed(
         known = [each for each in at if each is not None]
         if len(known) < len(at):
             break
-        num, steps = len(known), steps * spec.scheduler.reduction_factor
-        mean = Passed(sum(each.trained for each in known) / num, sum(each.score / num for each in known))
+        steps *= spec.scheduler.reduction_factor
+        mean = Passed(mean_of([each.trained for each in known]), mean_of([each.score for each in known]))
         # One evaluation may come after two rungs.
         if not found or mean.trained > found[-1].trained:
             found.append(mean)
     return tuple(found)
+
+
+def mean_of(values: Sequence[float]) -> float:
+    """Return the mean of some finite numbers; equal ones may have another mean by another order of sums and shares."""
+    total = sum(values)
+    # The sum of numbers near the ends of what a float can be may be infinite, where their mean is not.
+    return total / len(values) if math.isfinite(total) else sum(value / len(values) for value in values)
 
 
 def _at(spec: SweepSpec, record: TrialRecord, curve: Sequence[Score], steps: float) -> Passed | None:
