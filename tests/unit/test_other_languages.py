@@ -73,6 +73,12 @@ def test_parentheses_that_are_meant_are_no_problem(tmp_path: Path) -> None:
     assert "YAML has no" not in refused(tmp_path, "env: CartPole-v1\nalgorithm: ppx\nabout: Two (a, b)\n").message
 
 
+@pytest.mark.parametrize("source", ["Schulman et al. (2017)", "Two sizes (64, 64)", "Sizes (64,)"])
+def test_numbers_of_a_title_are_none_of_another_field_s_problem(tmp_path: Path, source: str) -> None:
+    text = f"env: CartPole-v1\nalgorithm: ppo\nnum_samples: -1\nabout: {{title: 'PPO', source: '{source}'}}\n"
+    assert refused(tmp_path, text).message == ("sweep.yaml: num_samples: -1 is not allowed: it should be at least 1")
+
+
 @pytest.mark.parametrize("section", ["space", "hyperparams"])
 @pytest.mark.parametrize("value", [tune.loguniform(1e-4, 1e-2), tune.choice([1, 2]), lambda: 3])
 def test_a_domain_of_ray_tune_is_answered_with_how_domains_are_written(section: str, value: Any) -> None:

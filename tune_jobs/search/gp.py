@@ -22,7 +22,7 @@ from tune_jobs.search.fidelity import Lengths
 from tune_jobs.search.gaussian_process import Observed, Posterior, Settings, fit
 from tune_jobs.search.history import KnownPoint
 from tune_jobs.search.improvement import log_expected_improvement
-from tune_jobs.search.warped import observed
+from tune_jobs.search.warped import observed, tried
 
 Floats = NDArray[np.float64]
 _MOST_FITTED, _MOST_GIVEN = 120, 240
@@ -47,7 +47,7 @@ def propose(question: Question, check: Check) -> dict[str, Any]:
     awaited = cube.units([point.point for point in question.known if point.is_running])
     if lengths.is_column:
         # Of points, not of what they had at rungs: what is left out here would be proposed again.
-        _, units = observed(cube, question.known, _MOST_GIVEN, lengths)
+        units = tried(cube, question.known, _MOST_GIVEN)
     places = lengths.places(np.concatenate([units, awaited]))
     whole = lengths.of_whole(cube.columns(places))
     posterior = Posterior(

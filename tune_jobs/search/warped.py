@@ -97,7 +97,7 @@ def rank_of(point: KnownPoint) -> tuple[float, float]:
 def _with_distances(quantiles: Floats, keys: Floats, shares: Floats) -> Floats:
     """Return the quantiles, of which those of the better half, if nothing ended it, also tell how much better it is.
 
-    What a scheduler ended is of another scale, as it was judged earlier.
+    What counts by the rung that a scheduler ended it at is of another scale, as it was judged earlier.
     """
     upper = np.isinf(keys[:, 0]) & (shares >= 0.5)
     if not upper.any():
@@ -151,6 +151,19 @@ def observed(
     units = cube.units([ended[index].point for index in chosen])
     columns = lengths.beside(cube.columns(units), [ended[index] for index in chosen])
     return Observed(columns, scores[chosen], counts[chosen], float(spreads[chosen].sum())), units
+
+
+def tried(cube: Cube, known: Sequence[KnownPoint], most: int) -> Floats:
+    """Return the places of points that have ended, shape (at most `most`, num_sides), each point counted once.
+
+    Args:
+        cube: The search space.
+        known: All points.
+        most: As for `observed`.
+    """
+    ended = [point for point in known if not point.is_running]
+    scores = np.array([-math.inf if point.score is None else point.score for point in ended])
+    return cube.units([ended[index].point for index in _some(scores, most)])
 
 
 def _some(means: Floats, most: int) -> NDArray[np.int64]:

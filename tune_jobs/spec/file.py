@@ -129,7 +129,7 @@ def load_spec(source: str | Path | Mapping[str, Any], overrides: Sequence[str] =
         found = error.problems
     told = [Problem(path, f"{what}{' (from --set)' if _is_set(path, set_paths) else ''}") for path, what in found]
     # Where numbers in parentheses are cut at their commas, each part is a problem that leads elsewhere.
-    cause = text_of_parentheses(text)
+    cause = text_of_parentheses(text, "\n".join(map(" ".join, told)))
     raise WrongSpecError.of(label, told if cause is None else [Problem("", cause), *told])
 
 

@@ -49,18 +49,20 @@ def text_of_toml(text: str) -> str | None:
     return f"Sweep files are YAML, as in `env: CartPole-v1`; the line {shortened(first)} is of another language."
 
 
-def text_of_parentheses(text: str) -> str | None:
-    """Return how to write the first numbers in parentheses, which YAML reads as words; None: there are none.
+def text_of_parentheses(text: str, problems: str) -> str | None:
+    """Return how to write the first tuple of numbers, which YAML reads as words; None: there is none that is a problem.
 
     Args:
-        text: The content of a sweep file.
+        text: The content of a sweep file. A title may have numbers in parentheses, as the year of a source.
+        problems: What is wrong with the sweep: it names a part of the tuple.
     """
     without_comments = re.sub(r"(?m)(?:^|(?<=[ \t]))#.*$", "", text)
-    found = _IN_PARENTHESES.search(without_comments)
-    if found is None:
-        return None
-    line = without_comments.count("\n", 0, found.start()) + 1
-    return f"line {line}: YAML has no {found[0]}: write [{found[1].strip()}]"
+    for found in _IN_PARENTHESES.finditer(without_comments):
+        parts = [part.strip() for part in found[0].split(",")]
+        if len(parts) > 1 and any(part in problems for part in (parts[0], parts[-1]) if len(part) > 1):
+            line = without_comments.count("\n", 0, found.start()) + 1
+            return f"line {line}: YAML has no {found[0]}: write [{found[1].strip()}]"
+    return None
 
 
 def number_in(text: str) -> float | None:
